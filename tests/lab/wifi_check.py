@@ -90,7 +90,7 @@ def one_way(channel):
     ends = (("handed_to_kernel", "tx_software"), ("tx_software", "rx_software"))
     parts = [segment["distribution"] for segment in account["segments"]
              if (segment["from"], segment["to"]) in ends]
-    bound = account["end_to_end"]["alignment_bound_ns"]
+    bound = account["end_to_end"]["bound"]["largest_ns"]
     return sum(part["min_ns"] for part in parts), sum(part["p50_ns"] for part in parts), bound
 
 

@@ -7,9 +7,9 @@ use super::fold::{RecordsAtHand, each_history};
 use super::gaps::{Bursts, GapFold};
 use super::history::{Copies, MessageHistory};
 use super::metrics::{ChannelAccount, FateCounts, InterruptionMetrics};
-use super::network::round_trip;
 use super::segments::SegmentFold;
 use super::{AccountContext, ChannelRecords};
+use hil_stats::histogram::{Distribution, LatencyHistogram};
 
 /// Sums messages up to the account of a channel. Memory grows by the few bytes a message that exact
 /// quantiles take.
@@ -92,7 +92,6 @@ impl<'a> AccountFold<'a> {
             duplicated_count: at_hand.ingress.then_some(self.copies.duplicated_count),
             late_count: at_hand.ingress.then_some(self.copies.late_count),
             segments: self.segments.segments(),
-            hardware_wire: self.segments.hardware_wire(),
             end_to_end: self.segments.end_to_end(),
             closing: self.segments.closing(),
             coverage: self.segments.coverage,
@@ -110,6 +109,14 @@ impl<'a> AccountFold<'a> {
                 .collect(),
         }
     }
+}
+
+fn round_trip(round_trips_ns: &[i64]) -> Distribution {
+    let mut histogram = LatencyHistogram::default();
+    for round_trip_ns in round_trips_ns {
+        histogram.record(*round_trip_ns);
+    }
+    histogram.distribution("no clock exchange took place")
 }
 
 /// Draws up the account of one channel from its record files. Time grows with the number of records.

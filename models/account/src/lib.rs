@@ -290,8 +290,6 @@ pub struct AccountContext<'a> {
     /// True when a witness reads the channel beside its consumer, who keeps no records, and wrote the records of what
     /// was taken: what it missed the consumer may have taken, and what it took while the consumer was away was lost.
     pub has_witness: bool,
-    /// True when both network cards take their stamps from one hardware clock.
-    pub cards_share_clock: bool,
     /// Round trips of the gateways' clock exchange, nanoseconds.
     pub round_trips_ns: &'a [i64],
 }
@@ -309,7 +307,6 @@ impl<'a> AccountContext<'a> {
             depth: None,
             first_number: FirstNumber::Zero,
             has_witness: false,
-            cards_share_clock: false,
             round_trips_ns: &[],
         }
     }

@@ -32,8 +32,6 @@ pub struct ChannelAccount {
     /// The way of a message in order: first each pair of neighbouring stages, available or not,
     /// then pairs that some message had to combine because a stage between was missing.
     pub segments: Vec<SegmentMetrics>,
-    /// Card to card, beside the chain because a card's clock is its own.
-    pub hardware_wire: Option<Distribution>,
     /// Published to taken, as the consumer's own record has it.
     pub end_to_end: EndToEnd,
     /// Whether the segments of each message add up.
@@ -135,11 +133,16 @@ pub struct EndToEnd {
     pub p50_interval: Option<Spread>,
     /// The same of the 99th percentile.
     pub p99_interval: Option<Spread>,
-    /// Largest error from clock alignment, nanoseconds; 0 on one clock.
-    pub alignment_bound_ns: Option<u64>,
     /// Errors from clock alignment over all messages; zero on one clock.
     #[serde(default)]
     pub bound: Option<BoundMetrics>,
+}
+
+impl EndToEnd {
+    /// Largest error from clock alignment, nanoseconds; 0 on one clock.
+    pub fn alignment_bound_ns(&self) -> Option<u64> {
+        self.bound.map(|bound| bound.largest_ns)
+    }
 }
 
 /// Whether published-to-taken equals the sum of the segments, message by message.
@@ -207,6 +210,9 @@ pub struct StampCoverage {
     /// Kernel transmit stamps, of the messages handed to the kernel. On a host without the
     /// sender's records: of the messages received, by follow-up.
     pub tx_software: Option<Coverage>,
+    /// Of the kernel transmit stamps, those taken before the queueing discipline: the driver stamps no departures.
+    #[serde(default)]
+    pub tx_before_queue_count: u64,
     /// Card transmit stamps.
     pub tx_hardware: Option<Coverage>,
     /// Kernel receive stamps, of the messages received.

@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::network::Crossing;
 use crate::stage::MessageFate;
-use crate::{MessageHistory, RecordSource, RecordsAtHand};
-use hil_core::record::{EgressRecord, UNAVAILABLE};
+use crate::{MessageHistory, RecordsAtHand};
+use hil_core::record::EgressRecord;
 
 /// What became of the messages a gateway sent, by the radio's report of their last datagram. Every
 /// message handed to the kernel is in exactly one row, and there in exactly one class.
@@ -96,35 +96,6 @@ impl Share {
     }
 }
 
-/// Where the transmit stamps of a channel were taken.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct TransmitStampMetrics {
-    /// Messages handed to the kernel.
-    pub handed_count: u64,
-    /// Stamped by the driver when they left.
-    pub departure_count: u64,
-    /// Stamped before the queueing discipline: the driver stamps no departures.
-    pub before_queue_count: u64,
-    /// Without a kernel stamp: the gateway's own, before the send call, is the last known.
-    pub application_count: u64,
-}
-
-/// Where the transmit stamps of `egress` were taken.
-pub fn transmit_stamps(egress: &dyn RecordSource<EgressRecord>) -> TransmitStampMetrics {
-    let mut figures = TransmitStampMetrics::default();
-    for record in egress.each().filter(EgressRecord::was_handed) {
-        figures.handed_count += 1;
-        let is_before_queue = record.flags & EgressRecord::STAMPED_BEFORE_QUEUE != 0;
-        let counter = match (record.tx_software_ns == UNAVAILABLE, is_before_queue) {
-            (true, _) => &mut figures.application_count,
-            (false, true) => &mut figures.before_queue_count,
-            (false, false) => &mut figures.departure_count,
-        };
-        *counter += 1;
-    }
-    figures
-}
-
 /// Sets what the radio reported against what arrived, message by message. Fates are those of the account, so
 /// that what was under way at the end, or met a gateway that was down, counts as neither lost in the air
 /// nor above it.
@@ -199,7 +170,7 @@ mod tests {
         AccountContext, ChannelPath, ChannelRecords, Interruption, PathProcess, RunSpan,
         each_history,
     };
-    use hil_core::record::IngressRecord;
+    use hil_core::record::{IngressRecord, UNAVAILABLE};
     use hil_core::time::{Alignment, Instant};
 
     const ACK: u32 = EgressRecord::RADIO_ACKNOWLEDGED;
@@ -362,20 +333,5 @@ mod tests {
         assert_eq!(radio_metrics(&records, &context()), None);
         let nothing = ChannelRecords::default();
         assert_eq!(radio_metrics(&nothing, &context()), None);
-    }
-
-    #[test]
-    fn transmit_stamps_are_counted_by_where_they_were_taken() {
-        let mut egress = vec![sent(0, 0), sent(1, EgressRecord::STAMPED_BEFORE_QUEUE)];
-        let mut bare = sent(2, 0);
-        bare.tx_software_ns = UNAVAILABLE;
-        egress.push(bare);
-        let expected = TransmitStampMetrics {
-            handed_count: 3,
-            departure_count: 1,
-            before_queue_count: 1,
-            application_count: 1,
-        };
-        assert_eq!(transmit_stamps(&egress), expected);
     }
 }

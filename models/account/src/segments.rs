@@ -99,13 +99,11 @@ pub(super) struct SegmentFold<'a> {
     at_hand: RecordsAtHand,
     is_gateway: bool,
     path: ChannelPath<'a>,
-    cards_share_clock: bool,
     /// By first and last stage of the segment.
     segments: Vec<Option<LatencyHistogram>>,
     /// Of the segments that cross from host to host: how far each length may be off.
     bounds_ns: Vec<Bounds>,
     mark_counts: [u64; Stage::COUNT],
-    hardware: LatencyHistogram,
     end_to_end: LatencyHistogram,
     end_to_end_ns: Samples,
     end_to_end_bounds_ns: Bounds,
@@ -122,11 +120,9 @@ impl<'a> SegmentFold<'a> {
             at_hand,
             is_gateway: context.path.is_gateway(),
             path: context.path,
-            cards_share_clock: context.cards_share_clock,
             segments: vec![None; Stage::COUNT * Stage::COUNT],
             bounds_ns: vec![Bounds::default(); Stage::COUNT * Stage::COUNT],
             mark_counts: [0; Stage::COUNT],
-            hardware: LatencyHistogram::default(),
             end_to_end: LatencyHistogram::default(),
             end_to_end_ns: Samples::default(),
             end_to_end_bounds_ns: Bounds::default(),
@@ -148,6 +144,7 @@ impl<'a> SegmentFold<'a> {
                 tx_hardware: covers(egress),
                 rx_software: covers(ingress),
                 rx_hardware: covers(ingress),
+                tx_before_queue_count: 0,
             },
         }
     }
@@ -178,7 +175,6 @@ impl<'a> SegmentFold<'a> {
             }
             is_ordered &= length_ns >= -ORDER_TOLERANCE_NS.saturating_add_unsigned(bound_ns);
         }
-        self.count_hardware(message);
         // Of a part of the way there is no sum to hold against the whole: a clock was stepped meanwhile.
         if !is_whole && self.path.is_aligned() && message.taken.is_some() {
             self.closing.unaligned_count += 1;
@@ -281,6 +277,9 @@ impl<'a> SegmentFold<'a> {
             ] {
                 coverage.get_or_insert_default().count(has(ns));
             }
+            let is_before_queue = egress.flags & EgressRecord::STAMPED_BEFORE_QUEUE != 0;
+            coverage.tx_before_queue_count +=
+                u64::from(has(egress.tx_software_ns) && is_before_queue);
         } else if !self.at_hand.egress
             && message.arrived().is_some()
             && let Some(coverage) = &mut coverage.tx_software
@@ -294,20 +293,6 @@ impl<'a> SegmentFold<'a> {
             ] {
                 coverage.get_or_insert_default().count(has(ns));
             }
-        }
-    }
-
-    fn count_hardware(&mut self, message: &MessageHistory) {
-        let sent_ns = message
-            .egress
-            .and_then(|record| stamp(record.tx_hardware_ns));
-        let received_ns = message
-            .ingress
-            .and_then(|record| stamp(record.rx_hardware_ns));
-        if let Some((sent_ns, received_ns)) = sent_ns.zip(received_ns)
-            && self.cards_share_clock
-        {
-            self.hardware.record(received_ns.saturating_sub(sent_ns));
         }
     }
 
@@ -371,20 +356,6 @@ impl<'a> SegmentFold<'a> {
         "no message has both ends".to_owned()
     }
 
-    /// Card to card; `None` on a direct channel.
-    pub(super) fn hardware_wire(&self) -> Option<Distribution> {
-        let stamps = [self.coverage.tx_hardware, self.coverage.rx_hardware];
-        let is_stamped = |coverage: Option<Coverage>| coverage.is_some_and(|c| c.stamped_count > 0);
-        let reason = if !stamps.into_iter().all(is_stamped) {
-            "no hardware stamps at both ends"
-        } else if self.cards_share_clock {
-            "no message has both hardware stamps"
-        } else {
-            "card clock not aligned"
-        };
-        self.is_gateway.then(|| self.hardware.distribution(reason))
-    }
-
     pub(super) fn end_to_end(&self) -> EndToEnd {
         let reason = match (self.path.is_aligned(), self.at_hand.taken) {
             (false, _) => NOT_ALIGNED,
@@ -392,7 +363,6 @@ impl<'a> SegmentFold<'a> {
             _ => "no message was taken",
         };
         let bound = self.end_to_end_bounds_ns.metrics();
-        let exact = self.path.has_one_clock().then_some(0);
         let ascending = self.end_to_end_ns.ascending();
         let quantiles = Quantiles::of(&self.end_to_end_ns, &ascending);
         let [p50_interval, p99_interval] = [0.5, 0.99].map(|share| quantiles.interval(share));
@@ -401,7 +371,6 @@ impl<'a> SegmentFold<'a> {
             p99_interval,
             distribution: self.end_to_end_ns.distribution(reason),
             bins: self.end_to_end.bins(),
-            alignment_bound_ns: bound.map(|bound| bound.largest_ns).or(exact),
             bound,
         }
     }

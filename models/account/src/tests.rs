@@ -454,25 +454,26 @@ fn unaligned_clocks_give_same_clock_segments_and_the_round_trip_only() {
         median(segment(&aligned, Stage::TxSoftware, Stage::RxSoftware)),
         RX_NS - TX_NS - 300,
     );
-    assert_eq!(aligned.end_to_end.alignment_bound_ns, Some(2_000));
+    assert_eq!(aligned.end_to_end.alignment_bound_ns(), Some(2_000));
     assert_eq!(aligned.closing.checked().unwrap().closed_count, 200);
 }
 
 #[test]
-fn hardware_stamps_give_a_segment_only_on_one_nic_clock() {
+fn stamps_are_counted_by_where_they_were_taken() {
     let mut files = Files::delivered(100);
     for (sent, arrived) in files.egress.iter_mut().zip(&mut files.ingress) {
         sent.tx_hardware_ns = sent.tx_software_ns + 37_000_000_400;
         arrived.rx_hardware_ns = sent.tx_hardware_ns + 650;
     }
-    let mut context = same_clock(100 * PERIOD_NS);
-    let apart = account(&files.records(), &context);
-    let reason = Distribution::unavailable("card clock not aligned");
-    assert_eq!(apart.hardware_wire, Some(reason));
-    assert_eq!(apart.coverage.tx_hardware.unwrap().ratio(), Some(1.0));
-    context.cards_share_clock = true;
-    let shared = account(&files.records(), &context);
-    assert_near(median(&shared.hardware_wire.unwrap()), 650);
+    files.egress[1].flags |= EgressRecord::STAMPED_BEFORE_QUEUE;
+    files.egress[2].tx_software_ns = UNAVAILABLE;
+    files.egress[3].flags |= EgressRecord::STAMPED_BEFORE_QUEUE;
+    files.egress[3].tx_software_ns = UNAVAILABLE;
+    let account = account(&files.records(), &same_clock(100 * PERIOD_NS));
+    let coverage = account.coverage;
+    assert_eq!(coverage.tx_hardware.unwrap().ratio(), Some(1.0));
+    assert_eq!(coverage.tx_software.unwrap().stamped_count, 98);
+    assert_eq!(coverage.tx_before_queue_count, 1);
 }
 
 #[test]
@@ -508,7 +509,6 @@ fn a_direct_channel_has_one_segment() {
         TAKEN_NS,
     );
     assert_eq!(account.closing.checked().unwrap().closed_count, 88);
-    assert_eq!(account.hardware_wire, None);
     assert_eq!(account.coverage, StampCoverage::default());
 }
 

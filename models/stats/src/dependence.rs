@@ -35,7 +35,7 @@ const LOW_COUNT: usize = 8;
 const SINGLE_COUNT: usize = 16;
 
 /// Values that a series must have: a quarter of them are ordinates.
-const COUNT_MIN: u64 = 4 * SINGLE_COUNT as u64;
+pub const COUNT_MIN: u64 = 4 * SINGLE_COUNT as u64;
 
 /// What long memory is given in advance, for a mean or share and for the outcomes beyond a quantile; of the rest white noise has
 /// [`WHITE_PRIOR`], fading memory the other part.
@@ -703,7 +703,7 @@ mod tests {
         let few = Batches::of_runs(40, [(3, 1), (9, 1)]).share_interval();
         assert_eq!(
             few.to_string(),
-            "no interval: 40 effective observations, 64 needed"
+            "no interval: as good as 40 independent ones, 64 needed"
         );
     }
 

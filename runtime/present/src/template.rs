@@ -73,7 +73,7 @@ pub fn render(
     environment.set_formatter(|out, state, value| {
         let is_text = value.as_str().is_some_and(|_| !value.is_safe());
         if is_text && state.auto_escape() == AutoEscape::Html {
-            let text = escaped(value.as_str().unwrap_or_default());
+            let text = escaped(&with_joints(value.as_str().unwrap_or_default()));
             return out.write_str(&text).map_err(minijinja::Error::from);
         }
         minijinja::escape_formatter(out, state, value)
@@ -150,6 +150,28 @@ fn field(figure: &Value, name: &str) -> Result<Value, minijinja::Error> {
     Ok(found)
 }
 
+/// Units between which and their number no line of a page may break.
+const UNITS: [&str; 28] = [
+    "ns", "us", "µs", "ms", "s", "min", "h", "%", "pp", "°", "deg", "deg/s", "°/s", "mm", "m",
+    "mm/s", "m/s", "B", "kB", "MB", "GB", "bit/s", "kbit/s", "Mbit/s", "Gbit/s", "Hz", "kHz",
+    "MHz",
+];
+
+/// With [`JOINT`] between each number and its unit, whoever wrote them.
+fn with_joints(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    let mut words = text.split(' ').peekable();
+    while let Some(word) = words.next() {
+        out.push_str(word);
+        if let Some(next) = words.peek() {
+            let unit = next.trim_end_matches([',', '.', ';', ':', ')', ']', '?', '!']);
+            let is_joined = word.ends_with(|c: char| c.is_ascii_digit()) && UNITS.contains(&unit);
+            out.push(if is_joined { JOINT } else { ' ' });
+        }
+    }
+    out
+}
+
 /// `text` for XML and HTML, within elements and quoted attributes.
 pub fn escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
@@ -212,6 +234,16 @@ fn tex_escaped(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn on_a_page_a_number_and_its_unit_stay_together() {
+        let text = "up to 3.88 % lost (every 4.00 ms), 60.0 s in 5 messages";
+        let page = render("page.html", "{{ text }}", &context! { text }, context! {}).unwrap();
+        let expected = "up to 3.88\u{a0}% lost (every 4.00\u{a0}ms), 60.0\u{a0}s in 5 messages";
+        assert_eq!(page, expected);
+        let plain = render("page.txt", "{{ text }}", &context! { text }, context! {}).unwrap();
+        assert_eq!(plain, text);
+    }
 
     #[test]
     fn each_language_keeps_a_text_a_text() {

@@ -24,7 +24,7 @@ const BAR_MIN: usize = 8;
 const TIME_WIDTH: usize = 14;
 const BESIDE_MARGIN: usize = INDENT + 4;
 /// Columns of what a strip shows, and of its scale.
-const WHAT_WIDTH: usize = 9;
+const WHAT_WIDTH_MIN: usize = 9;
 const SCALE_WIDTH: usize = 18;
 /// Eighths of a block, lowest first.
 const LEVELS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
@@ -341,15 +341,17 @@ fn event(canvas: &mut Canvas, event: &Event) {
 /// Series on one time axis: a strip of blocks each, time from left to right.
 pub fn strips(canvas: &mut Canvas, strips: &Strips) {
     let name_width = if canvas.width() < 100 { 18 } else { 20 };
-    let room = canvas.width() - INDENT - name_width - WHAT_WIDTH - SCALE_WIDTH - 2;
+    let widest = strips.rows.iter().map(|row| columns(&row.what) + 1).max();
+    let what_width = widest.unwrap_or(0).max(WHAT_WIDTH_MIN);
+    let room = canvas.width() - INDENT - name_width - what_width - SCALE_WIDTH - 2;
     for row in &strips.rows {
         let label = if row.what.is_empty() {
-            format!("{} ", left(&row.name, name_width + WHAT_WIDTH - 1))
+            format!("{} ", left(&row.name, name_width + what_width - 1))
         } else {
             format!(
                 "{} {}",
                 left(&row.name, name_width - 1),
-                left(&row.what, WHAT_WIDTH)
+                left(&row.what, what_width)
             )
         };
         let line = format!(
@@ -362,7 +364,7 @@ pub fn strips(canvas: &mut Canvas, strips: &Strips) {
         canvas.line(&line);
     }
     if !strips.marks_s.is_empty() {
-        let label = left(strips.marks_label, name_width + WHAT_WIDTH);
+        let label = left(strips.marks_label, name_width + what_width);
         let marks = marks(strips, room);
         let line = format!(
             "{:INDENT$}{}{}",
@@ -374,14 +376,20 @@ pub fn strips(canvas: &mut Canvas, strips: &Strips) {
     }
     let [begin, middle, end] = [0.0, 0.5, 1.0].map(|share| seconds(share * strips.whole_s));
     let half = room / 2;
-    let axis_margin = INDENT + name_width + WHAT_WIDTH;
+    let middle_width = half.saturating_sub(6);
+    let middle = if columns(&middle) < middle_width {
+        middle
+    } else {
+        String::new()
+    };
+    let axis_margin = INDENT + name_width + what_width;
     let column = format!("a column is {}", duration_s(strips.whole_s / room as f64));
     let axis = format!(
         "{:INDENT$}{}{}{}{}",
         "",
         left(&column, axis_margin - INDENT),
         left(&begin, half.saturating_sub(4)),
-        left(&middle, half.saturating_sub(6)),
+        left(&middle, middle_width),
         right(&end, room.saturating_sub(2 * half) + 10)
     );
     canvas.painted_line(Tone::Faint, &axis);

@@ -99,6 +99,14 @@ pub fn figure(value: f64) -> String {
     }
 }
 
+/// What is below this number above zero: two digits, rounded upwards.
+pub fn upper_bound(value: f64) -> String {
+    let digits = (1.0 - value.log10().floor()).clamp(-15.0, 15.0);
+    let scale = 10_f64.powf(digits);
+    let above = (value * scale).ceil() / scale;
+    format!("{above:.*}", digit_count(digits.max(0.0)))
+}
+
 #[allow(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -218,6 +226,15 @@ mod tests {
         assert_eq!(words(125.0, "1/s"), "125 per second");
         assert_eq!(words(11_338.0, "B/s"), "11.3 kB/s");
         assert_eq!(words(3.0, "grasps"), "3 grasps");
+    }
+
+    #[test]
+    fn bounds_are_rounded_away_from_what_they_exclude() {
+        assert_eq!(upper_bound(4.9929), "5.0");
+        assert_eq!(upper_bound(176.2), "180");
+        assert_eq!(upper_bound(299.57), "300");
+        assert_eq!(upper_bound(0.066_76), "0.067");
+        assert_eq!(upper_bound(1.01), "1.1");
     }
 
     #[test]

@@ -20,12 +20,12 @@ use super::clock_summary::ClockSection;
 use super::score_event::ExplainedEvent;
 use super::summary::{LinkKind, RunSummary};
 use hil_present::Tone;
-use hil_present::units::{duration_s, percent};
+use hil_present::units::{JOINT, duration_s, percent, upper_bound};
 
 /// A rate of fewer occasions is not told, and no harm in fewer is no answer.
 pub const OCCASIONS_MIN: u64 = 10;
 /// A network event within seconds before explains nothing where more moments than this share have one.
-const CHANCE_MAX: f64 = 0.5;
+pub(crate) const CHANCE_MAX: f64 = 0.5;
 /// Messages that the network lost in a row and that make an outage; fewer are single losses, which a lossy link always has.
 const OUTAGE_LOST_MIN: u64 = 3;
 /// Channels, processes or hosts that are named where many have the same fault.
@@ -111,6 +111,10 @@ impl HarmCount {
                     None => String::new(),
                     // How those come together that did not happen is unknown whatever the sample.
                     Some(Spread::Unknown(_)) if count == 0 => String::new(),
+                    // Too few, however independent: their number stands before it.
+                    Some(Spread::Unknown(why)) if why.effective >= occasions.count => {
+                        format!(" [no interval of fewer than {}]", grouped(why.needed))
+                    }
                     Some(Spread::Unknown(why)) => format!(" [{why}]"),
                     Some(Spread::Known(Interval { low, high, .. })) => {
                         format!(" [{}, {}]", percent(low), percent(high))
@@ -180,6 +184,11 @@ pub enum Unresolved {
         what: String,
         /// Why not.
         why: TooSmall,
+    },
+    /// Of a comparison: no repetition differs from another of its side, so that nothing tells how runs scatter.
+    NoScatter {
+        /// In what.
+        what: String,
     },
 }
 
@@ -351,16 +360,11 @@ impl Answer {
         joined(self.hurt.word(), self.reason())
     }
 
-    /// What a NO leaves open, in words; `None` of another answer.
-    pub(crate) fn left_open(&self) -> Option<String> {
-        // Of how many harms come together nothing is known, so an event of them is counted as one, of Poisson's law; the
-        // interval has one end (Garwood 1936).
-        let most = -(1.0 - CONFIDENCE).ln();
-        let percent = 100.0 * CONFIDENCE;
-        (self.hurt == Hurt::No).then(|| {
-            format!(
-                "a run this long can miss up to {most:.0} such events ({percent:.0} %, Poisson)"
-            )
+    /// Up to what a NO excludes harm, in words; `None` of another answer.
+    pub(crate) fn no_means(&self) -> Option<String> {
+        (self.hurt == Hurt::No).then(|| match &self.sample.occasions {
+            Some(OccasionCount { what, count }) => none_means(what, *count),
+            None => none_means("messages", self.sample.message_count),
         })
     }
 
@@ -438,17 +442,29 @@ impl Answer {
             message_count,
             occasions,
         } = &self.sample;
-        let messages = counted(*message_count, "message");
-        let channels = counted(*channel_count, "channel");
-        let text = format!("{length_s:.1} s, {messages} on {channels}");
+        let length = format!("in {length_s:.1}{JOINT}s");
         match occasions {
             Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
-                format!("{text}, {what}: {count}, too few for a rate, which takes {OCCASIONS_MIN}")
+                format!("{count} {what} {length}, too few for a rate, which takes {OCCASIONS_MIN}")
             }
-            Some(OccasionCount { what, count }) => format!("{text}, {} {what}", grouped(*count)),
-            None => text,
+            Some(OccasionCount { what, count }) => format!("{} {what} {length}", grouped(*count)),
+            None => {
+                let messages = counted(*message_count, "message");
+                let channels = counted(*channel_count, "channel");
+                format!("{messages} on {channels} {length}")
+            }
         }
     }
+}
+
+/// What it means that no harm was seen in `count` occasions. Of how many harms come together nothing is known, so an event
+/// of them is counted as one, of Poisson's law; the interval has one end (Garwood 1936).
+pub(crate) fn none_means(what: &str, count: u64) -> String {
+    let most = upper_bound(-1e3 * (1.0 - CONFIDENCE).ln() / count.max(1) as f64);
+    let percent = 100.0 * CONFIDENCE;
+    format!(
+        "fewer than {most} harms per 1,000 {what} ({percent:.0}{JOINT}%; those that come together count as one)"
+    )
 }
 
 /// A word, and why it is that.
@@ -513,8 +529,12 @@ impl fmt::Display for Unresolved {
             }
             Self::WithinChance => formatter.write_str("what difference there is, chance alone may make"),
             Self::NoInterval { what, why } => {
-                write!(formatter, "of the difference of {what} there is {why}")
+                write!(formatter, "the difference of {what} has {why}")
             }
+            Self::NoScatter { what } => write!(
+                formatter,
+                "no run differs from another of its side in {what}, and nothing tells how runs scatter"
+            ),
             Self::ClocksDiffer => formatter.write_str(
                 "the hosts' clocks are not aligned, which leaves open whether a network event came before the harm",
             ),
@@ -595,7 +615,8 @@ fn hurt(summary: &RunSummary, network: &NetworkVerdict) -> Hurt {
     if summary.harms.iter().any(|one| one.count.is_none()) {
         return not_resolvable(Unresolved::NotCounted);
     }
-    too_few_occasions(&summary.harms, tested_count(summary)).map_or(Hurt::No, not_resolvable)
+    too_few_occasions(&summary.harms, tested_count(summary), OCCASIONS_MIN)
+        .map_or(Hurt::No, not_resolvable)
 }
 
 /// The harm with the fewest occasions is the least tested: an absence of harm rests on these.
@@ -606,20 +627,21 @@ fn fewest_occasions<'a>(
     occasions.min_by_key(|one| one.count)
 }
 
-/// Nothing happened in the fewest occasions of a harm, and they are too few to tell. Harms without occasions are
-/// tested by the `message_count` messages that crossed.
+/// Nothing happened in the fewest occasions of a harm, and they are fewer than the `needed` to tell. Harms without occasions
+/// are tested by the `message_count` messages that crossed.
 pub(crate) fn too_few_occasions<'a>(
     harms: impl IntoIterator<Item = &'a HarmCount>,
     message_count: u64,
+    needed: u64,
 ) -> Option<Unresolved> {
     let (what, count) = match fewest_occasions(harms) {
         Some(OccasionCount { what, count }) => (what.as_str(), *count),
         None => ("messages", message_count),
     };
-    (count < OCCASIONS_MIN).then(|| Unresolved::SampleTooSmall {
+    (count < needed).then(|| Unresolved::SampleTooSmall {
         what: what.to_owned(),
         count,
-        needed: OCCASIONS_MIN,
+        needed,
     })
 }
 

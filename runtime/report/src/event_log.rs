@@ -153,6 +153,7 @@ mod tests {
             events: Vec::new(),
             more_count: 0,
             lost_count: 3,
+            losses: Vec::new(),
         });
         let words = "hold began (clock of robot-pc) | nothing of note on any channel in the 5.00 s \
                      before (only single losses, 3 messages)\n";

@@ -201,6 +201,27 @@ pub struct PrecedingNetwork {
     pub more_count: u64,
     /// Messages lost by the network in that time on all channels, those of the events included.
     pub lost_count: u64,
+    /// Channels that lost some of these, the one with the largest share first.
+    #[serde(default)]
+    pub losses: Vec<PrecedingLoss>,
+}
+
+/// What the network lost of a channel before an event of the score.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PrecedingLoss {
+    /// The channel.
+    pub channel: String,
+    /// Messages lost by the network.
+    pub lost_count: u64,
+    /// Messages handed to it.
+    pub sent_count: u64,
+}
+
+impl PrecedingLoss {
+    /// The share lost.
+    pub(crate) fn ratio(&self) -> f64 {
+        self.lost_count as f64 / self.sent_count.max(1) as f64
+    }
 }
 
 /// A network event that came before an event of the score.

@@ -72,6 +72,8 @@ pub(crate) struct Places<'a> {
     pub(crate) receiver: Option<&'a NicTimeline>,
     /// The receiving card, if there is one.
     pub(crate) receiving_nic: Option<&'a NicHistory>,
+    /// Both cards take their stamps from one hardware clock.
+    pub(crate) has_one_clock: bool,
 }
 
 #[derive(Default)]
@@ -181,10 +183,13 @@ struct StampFold {
     stack: SegmentTimes,
 }
 
-/// A stamp of the sending card; without a place on the host's monotonic clock where the clock of the card
-/// does not say.
+/// A stamp of the sending card.
 #[derive(Clone, Copy)]
-struct Departure(Option<Bounded>);
+struct Departure {
+    nic_ns: i64,
+    /// On the host's monotonic clock; `None` where the clock of the card does not say.
+    monotonic: Option<Bounded>,
+}
 
 impl StampFold {
     /// Counts what left; gives its stamp.
@@ -208,7 +213,7 @@ impl StampFold {
             let software = exact(software_ns);
             self.software.note(left.map(|left| between(left, software)));
         }
-        Some(Departure(monotonic))
+        Some(Departure { nic_ns, monotonic })
     }
 
     fn arrival(
@@ -228,8 +233,12 @@ impl StampFold {
             let software = exact(software_ns);
             self.stack.note(came.map(|came| between(software, came)));
         }
-        if let Some(Departure(left)) = left {
-            self.wire.note(crossing(left, came, record, path));
+        if let Some(left) = left {
+            self.wire.note(if places.has_one_clock {
+                Some(exact(nic_ns.saturating_sub(left.nic_ns)))
+            } else {
+                crossing(left.monotonic, came, record, path)
+            });
         }
     }
 }
@@ -376,6 +385,7 @@ mod tests {
             sender: Some(&ours),
             receiver: Some(&theirs),
             receiving_nic: Some(&story),
+            has_one_clock: false,
         };
         stamps_of(&egress, &ingress, Some(alignment), &places)
     }
@@ -419,6 +429,25 @@ mod tests {
     }
 
     #[test]
+    fn cards_of_one_clock_need_no_other() {
+        let egress = [sent(0, 500_000_000), sent(1, 510_000_000)];
+        let mut ingress = egress.each_ref().map(came);
+        for (sent, came) in egress.iter().zip(&mut ingress) {
+            came.rx_hardware_ns = sent.tx_hardware_ns + 650;
+        }
+        let places = |has_one_clock| Places {
+            sender: None,
+            receiver: None,
+            receiving_nic: None,
+            has_one_clock,
+        };
+        let one = stamps_of(&egress, &ingress, None, &places(true));
+        assert_eq!(median(&one.segments[2]), (650, 0));
+        let two = stamps_of(&egress, &ingress, None, &places(false));
+        assert_eq!(two.segments[2].unplaced_count, 2);
+    }
+
+    #[test]
     fn copies_of_a_message_are_neither_counted_nor_measured() {
         let copies = [
             (3, IngressRecord::DUPLICATE),
@@ -443,6 +472,7 @@ mod tests {
             sender: None,
             receiver: None,
             receiving_nic: None,
+            has_one_clock: false,
         };
         let figures = stamps_of(&egress, &ingress, None, &places);
         assert_eq!((figures.received_count, figures.rx_hardware_count), (1, 1));
@@ -469,6 +499,7 @@ mod tests {
             sender: None,
             receiver: None,
             receiving_nic: None,
+            has_one_clock: false,
         };
         let figures = stamps_of(&[sent(0, 5)], &Vec::new(), None, &places);
         assert_eq!(figures.tx_hardware_count, 1);

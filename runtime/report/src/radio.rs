@@ -1,11 +1,10 @@
 //! What a report says of radios: the association of each wireless hop during the run, and of each
-//! channel what the radio reported of its messages and where they were stamped. It draws no
-//! conclusion.
+//! channel what the radio reported of its messages. It draws no conclusion.
 
-use hil_account::radio::{RadioMetrics, TransmitStampMetrics};
+use hil_account::radio::RadioMetrics;
 use serde::{Deserialize, Serialize};
 
-/// Everything about radios. Empty on a wired run, but for where messages were stamped.
+/// Everything about radios. Empty on a wired run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct RadioReport {
@@ -27,8 +26,6 @@ impl RadioReport {
 pub struct ChannelRadio {
     /// Its name.
     pub channel: String,
-    /// Where its transmit stamps were taken; `None` without the sending gateway's records.
-    pub transmit_stamps: Option<TransmitStampMetrics>,
     /// What the radio reported of its messages; `None` when none reported anything.
     pub acknowledgements: Option<RadioMetrics>,
 }

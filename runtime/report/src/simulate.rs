@@ -143,11 +143,14 @@ pub fn simulate(
     summary.channels = channels
         .map(|channel| {
             let story = outages.iter().find(|story| story.channel == channel.name);
-            ChannelSummary {
-                outages: story.and_then(OutageHistory::metrics),
-                demand: demand_metrics(channel, &mut accounts),
-                ..channel_summary(topology, channel, &result, links.get(&channel.name))
+            let mut found = channel_summary(topology, channel, &result, links.get(&channel.name));
+            found.outages = story.and_then(OutageHistory::metrics);
+            found.demand = demand_metrics(channel, &mut accounts);
+            if let Some(account) = &mut found.account {
+                let link = accounts.get(&channel.name);
+                account.duplicated_count = link.map(|link| link.duplicated_count);
             }
+            found
         })
         .collect();
     let directions = links.iter().map(|(name, link)| link.direction(name));
@@ -193,8 +196,6 @@ fn network(
                 path: ChannelPath::SharedMemory,
                 run_ns: Some((0, length_ns)),
                 payload_bytes: Some(crossing.channel.message.size_bytes as f64),
-                duplicated_count: Some(account.duplicated_count),
-                round_trips_ns: &[],
             },
         });
     }
@@ -384,13 +385,11 @@ fn account(counts: &ChannelCounts) -> ChannelAccount {
         duplicated_count: None,
         late_count: None,
         segments: Vec::new(),
-        hardware_wire: None,
         end_to_end: EndToEnd {
             distribution: unavailable(),
             bins: Vec::new(),
             p50_interval: None,
             p99_interval: None,
-            alignment_bound_ns: None,
             bound: None,
         },
         closing: Closing::Unavailable {

@@ -74,7 +74,7 @@ fn check_channels(summary: &RunSummary) {
         );
         assert!(bound.median_ns > 0 && bound.median_ns <= bound.largest_ns);
         assert_eq!(
-            account.end_to_end.alignment_bound_ns,
+            account.end_to_end.alignment_bound_ns(),
             Some(bound.largest_ns)
         );
         assert!(delays.min_ns >= -i64::try_from(bound.largest_ns).unwrap());

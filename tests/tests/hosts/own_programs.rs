@@ -70,9 +70,10 @@ fn an_interface_that_is_down_is_a_loss_of_the_network_and_programs_have_whole_ac
         assert_eq!(of(MessageFate::UnknownPeerRecordsUnavailable), 0, "{said}");
         let network = summary.network.as_ref().unwrap();
         let channel = network.channels.iter().find(|one| one.channel == "there/0");
-        let loss = channel.unwrap().figures.loss.measured().unwrap();
+        let figures = &channel.unwrap().figures;
+        let loss = figures.loss.measured().unwrap();
         assert!(
-            loss.lost_count >= of(MessageFate::NetworkUnreachable),
+            figures.lost_count >= of(MessageFate::NetworkUnreachable),
             "{loss:?}"
         );
         assert!(loss.longest.unwrap().length_ns > 1_500_000_000, "{loss:?}");

@@ -17,11 +17,7 @@ pub const BURST_GAP_MIN: u64 = 16;
 /// Losses of the network.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LossMetrics {
-    /// Messages lost.
-    pub lost_count: u64,
-    /// Of so many handed to the network.
-    pub of_count: u64,
-    /// Their share.
+    /// The share lost of what the network was handed.
     pub ratio: f64,
     /// 95 % interval of the share, or why there is none.
     pub interval: Spread,
@@ -138,8 +134,6 @@ pub(super) fn losses(passages: &Passages, run_ns: Option<(i64, i64)>) -> Metric<
         lengths.add(run.lost_count);
     }
     Metric::Measured(LossMetrics {
-        lost_count,
-        of_count,
         ratio: lost_count as f64 / of_count as f64,
         interval: Batches::of_runs(of_count, of_runs).share_interval(),
         runs: lengths.finish(),

@@ -36,7 +36,7 @@ pub use loss::{BURST_GAP_MIN, BurstMetrics, LongestLoss, LossBounds, LossMetrics
 pub use order::OrderMetrics;
 
 use crate::{ChannelPath, Side};
-use hil_stats::histogram::{Distribution, DurationBin, LatencyHistogram};
+use hil_stats::histogram::DurationBin;
 
 /// What the network did to one message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -123,10 +123,6 @@ pub struct NetworkContext<'a> {
     pub run_ns: Option<(i64, i64)>,
     /// Payload of a message that arrived, the mean where they differ in length.
     pub payload_bytes: Option<f64>,
-    /// Copies that the receiving gateway had seen before; `None` without its records.
-    pub duplicated_count: Option<u64>,
-    /// Round trips of the gateways' clock exchange.
-    pub round_trips_ns: &'a [i64],
 }
 
 /// The network's figures of one channel, which is one direction.
@@ -147,8 +143,6 @@ pub struct NetworkMetrics {
     /// Of the unknown ones, those that the network lost, or the receiving host for want of room.
     #[serde(default)]
     pub doubtful_count: u64,
-    /// Copies received again; `None` without the receiver's records.
-    pub duplicated_count: Option<u64>,
     /// Messages per second handed to the network, from the first to the last of them.
     pub offered_per_s: Option<f64>,
     /// Of these, messages per second that were received, over the same time: what was lost at its end lowers this rate
@@ -168,8 +162,6 @@ pub struct NetworkMetrics {
     pub loss: Metric<LossMetrics>,
     /// Reordering.
     pub order: Metric<OrderMetrics>,
-    /// Round trips of the gateways' clock exchange.
-    pub round_trip: Distribution,
 }
 
 impl NetworkMetrics {
@@ -194,7 +186,6 @@ impl NetworkMetrics {
             host_lost_count: counts.host_lost,
             unknown_count: counts.unknown + counts.doubtful,
             doubtful_count: counts.doubtful,
-            duplicated_count: context.duplicated_count,
             offered_per_s,
             arrived_per_s,
             arrived_bytes_per_s: context
@@ -212,7 +203,6 @@ impl NetworkMetrics {
                 ),
             },
             order: order::order(passages),
-            round_trip: round_trip(context.round_trips_ns),
         }
     }
 
@@ -226,15 +216,6 @@ impl NetworkMetrics {
             doubtful_count,
         })
     }
-}
-
-/// Round trips of the gateways' clock exchange.
-pub(crate) fn round_trip(round_trips_ns: &[i64]) -> Distribution {
-    let mut histogram = LatencyHistogram::default();
-    for round_trip_ns in round_trips_ns {
-        histogram.record(*round_trip_ns);
-    }
-    histogram.distribution("no clock exchange took place")
 }
 
 /// Messages by what became of them.

@@ -39,7 +39,7 @@
 //! let line = end.map(EgmEvent::describe);
 //! assert_eq!(
 //!     line.as_deref(),
-//!     Some("right arm: session 1 ended: no message for 1.003 s (CommTimeout = 1 s)")
+//!     Some("right arm: EGM session 1 ended: no message for 1.003 s (CommTimeout = 1 s)")
 //! );
 //! # Ok::<(), hil_core::case_study::ParameterError>(())
 //! ```

@@ -219,20 +219,26 @@ impl Pause {
         let why = match self.after {
             PauseAfter::Start => {
                 return format!(
-                    "no session had begun until {:.3} s",
+                    "the arm took no commands until {:.3} s, when its first EGM session began",
                     since(self.span.end_ns)
                 );
             }
-            PauseAfter::Session(Some(EndCause::CommTimeout)) => "the last one ended by CommTimeout",
-            PauseAfter::Session(Some(EndCause::ConditionTime)) => "the last one ended by CondTime",
-            PauseAfter::Session(Some(EndCause::PositionDeviation)) => {
-                "the last one ended by MaxPosDeviation"
+            PauseAfter::Session(Some(EndCause::CommTimeout)) => {
+                "its EGM session had ended by CommTimeout"
             }
-            PauseAfter::Session(Some(EndCause::Requested)) => "the last one was stopped by request",
-            PauseAfter::Session(None) => "why the last one ended is not recorded",
+            PauseAfter::Session(Some(EndCause::ConditionTime)) => {
+                "its EGM session had ended by CondTime"
+            }
+            PauseAfter::Session(Some(EndCause::PositionDeviation)) => {
+                "its EGM session had ended by MaxPosDeviation"
+            }
+            PauseAfter::Session(Some(EndCause::Requested)) => {
+                "its EGM session had been stopped by request"
+            }
+            PauseAfter::Session(None) => "why its EGM session ended is not recorded",
         };
         let (begin_s, end_s) = (since(self.span.begin_ns), since(self.span.end_ns));
-        format!("no session from {begin_s:.3} s to {end_s:.3} s ({why})")
+        format!("the arm took no commands from {begin_s:.3} s to {end_s:.3} s ({why})")
     }
 }
 
@@ -541,13 +547,13 @@ mod tests {
         assert_eq!(cause(3), LossCause::Trip(first));
         assert_eq!(
             cause(3).text(1_000_000_000),
-            "no session had begun until 4.000 s"
+            "the arm took no commands until 4.000 s, when its first EGM session began"
         );
         // The loop's peak was due before the session ended: the text holds all the same.
         assert_eq!(cause(19), LossCause::Trip(timed_out));
         assert_eq!(
             cause(19).text(1_000_000_000),
-            "no session from 19.000 s to 21.000 s (the last one ended by CommTimeout)"
+            "the arm took no commands from 19.000 s to 21.000 s (its EGM session had ended by CommTimeout)"
         );
         assert_eq!(cause(40), LossCause::Trip(unknown));
         assert_eq!(cause(60), LossCause::Held);

@@ -64,10 +64,13 @@ impl Sessions {
 
     pub(crate) fn ended_by_themselves(&self, record: &Record) -> Harm {
         let is_known = !record.feedback.is_empty();
-        Harm::new(
-            "sessions of the right arm lost",
-            is_known.then_some(self.trips.len() as u64),
-        )
+        Harm {
+            note: "the arm takes commands only in one",
+            ..Harm::new(
+                "EGM sessions of the right arm lost",
+                is_known.then_some(self.trips.len() as u64),
+            )
+        }
     }
 
     pub(crate) fn metrics(&self, record: &Record) -> Vec<Metric> {

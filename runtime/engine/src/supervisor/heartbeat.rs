@@ -16,11 +16,11 @@ const SILENCE_MAX: Duration = Duration::from_secs(3);
 
 /// Who is silent.
 #[derive(Debug, Default)]
-pub(super) struct Heartbeats {
+pub(super) struct SilentProcesses {
     silent: BTreeSet<usize>,
 }
 
-impl Heartbeats {
+impl SilentProcesses {
     /// Looks at all processes at `now`; what changed is noted in the process group's events and given back in
     /// words.
     pub(super) fn look(&mut self, process_group: &mut ProcessGroup, now: Instant) -> Vec<String> {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant as WallInstant};
 use hil_core::time::Instant;
 
 use super::child::Child;
-use super::heartbeat::Heartbeats;
+use super::heartbeat::SilentProcesses;
 use super::peer_status::PeerStatus;
 use super::process_group::{ManagedProcess, ProcessGroup};
 use super::progress_line;
@@ -25,7 +25,7 @@ pub(super) struct StatusPublisher {
     file: StatusFile,
     /// What was told last, and when.
     told: Option<(Phase, WallInstant)>,
-    heartbeats: Heartbeats,
+    silent_processes: SilentProcesses,
 }
 
 impl StatusPublisher {
@@ -34,7 +34,7 @@ impl StatusPublisher {
         Self {
             file: StatusFile::of(folder),
             told: None,
-            heartbeats: Heartbeats::default(),
+            silent_processes: SilentProcesses::default(),
         }
     }
 
@@ -95,10 +95,13 @@ impl StatusPublisher {
         match phase {
             Phase::Starting => console.announce_alive(),
             Phase::Running => {
-                for words in self.heartbeats.look(process_group, MonotonicClock::now()) {
+                for words in self
+                    .silent_processes
+                    .look(process_group, MonotonicClock::now())
+                {
                     console.warn(&words);
                 }
-                if self.heartbeats.are_all_there() {
+                if self.silent_processes.are_all_there() {
                     console.announce_up();
                 }
             }

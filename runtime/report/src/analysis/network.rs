@@ -22,14 +22,14 @@ pub(crate) use super::robot_series::RobotSeries;
 use super::robot_series::{index_of, without_holes};
 use crate::network::{
     ChannelNetwork, Correlation, CorrelationTests, NetworkQuantity, NetworkReport, PRECEDING_S,
-    PrecedingEvent, PrecedingNetwork, SeldomSeries, TestedPair, TimedEvent, Timeline, TimelineRow,
-    TimelineSubject,
+    PrecedingEvent, PrecedingLoss, PrecedingNetwork, SeldomSeries, TestedPair, TimedEvent,
+    Timeline, TimelineRow, TimelineSubject,
 };
 use crate::score_event::ScoreEvents;
 use hil_rundir::run_result::RunResult;
 use hil_topology::Channel;
 
-/// Network events a summary keeps, and of those before one event of the score.
+/// Network events a summary keeps, and of those before one event of the score, as of channels with losses then.
 const EVENTS_MAX: usize = 2_000;
 const PRECEDING_MAX: usize = 8;
 
@@ -218,14 +218,23 @@ impl NetworkBuilder {
             .collect();
         // Of those under way the one that began first weighs most.
         found.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.from_s.total_cmp(&b.1.from_s)));
-        let lost = |bins: &NetworkBins| {
+        let loss = |(channel, bins): &(String, NetworkBins)| {
             let width_s = bins.width_ns as f64 * 1e-9;
             let from_s = at_s - PRECEDING_S - clock_bound_s;
             let first = index_of(from_s.max(0.0) / width_s).unwrap_or(0);
             let last = index_of((at_s + clock_bound_s) / width_s).map_or(0, |last| last + 1);
-            let within = bins.bins.iter().take(last).skip(first);
-            within.map(|bin| bin.lost_count).sum::<u64>()
+            let within = || bins.bins.iter().take(last).skip(first);
+            PrecedingLoss {
+                channel: channel.clone(),
+                lost_count: within().map(|bin| bin.lost_count).sum(),
+                sent_count: within().map(|bin| bin.sent_count).sum(),
+            }
         };
+        let losses = self.bins.iter().map(loss);
+        let mut losses: Vec<_> = losses.filter(|one| one.lost_count > 0).collect();
+        let lost_count = losses.iter().map(|one| one.lost_count).sum();
+        losses.sort_by(|a, b| b.ratio().total_cmp(&a.ratio()));
+        losses.truncate(PRECEDING_MAX);
         PrecedingNetwork {
             foregoing_s: PRECEDING_S,
             more_count: found.len().saturating_sub(PRECEDING_MAX) as u64,
@@ -234,7 +243,8 @@ impl NetworkBuilder {
                 .take(PRECEDING_MAX)
                 .map(|(over_for_s, event)| PrecedingEvent::of(event, at_s, *over_for_s))
                 .collect(),
-            lost_count: self.bins.iter().map(|(_, bins)| lost(bins)).sum(),
+            lost_count,
+            losses,
         }
     }
 }
@@ -469,10 +479,8 @@ fn add_channel(
     };
     records.consult(channel, |files, context| {
         let mut ways = Passages::default();
-        let mut duplicated_count = 0;
         each_history(files, context, |message| {
             ways.push(&message.passage(context.path));
-            duplicated_count += message.copies.duplicated_count;
             if let Some(frames) = &mut frames {
                 frames.note(message);
             }
@@ -494,8 +502,6 @@ fn add_channel(
                 path: context.path,
                 run_ns: Some((producer_start.as_ns(), producer_end.as_ns())),
                 payload_bytes,
-                duplicated_count: files.ingress.map(|_| duplicated_count),
-                round_trips_ns: context.round_trips_ns,
             },
         });
     });

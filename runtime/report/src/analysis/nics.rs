@@ -35,6 +35,7 @@ pub(super) fn hardware_stamps(records: &RunRecords<'_>) -> Option<HardwareStamps
                 sender: timelines.get(crossing.from_host.name.as_str()),
                 receiver: timelines.get(crossing.to_host.name.as_str()),
                 receiving_nic: nic_of(result, &crossing.to_host.name),
+                has_one_clock: share_a_clock(result, &crossing),
             };
             channel_stamps(name, files, context, &places)
         })
@@ -56,7 +57,7 @@ fn nic_of<'a>(result: &'a RunResult, host: &str) -> Option<&'a NicHistory> {
 
 /// True when both ends of a channel take their stamps from one clock: the clocks of the hosts are
 /// one, and so is the number of the cards' clock, which a kernel gives once.
-pub(super) fn share_a_clock(result: &RunResult, crossing: &Crossing<'_>) -> bool {
+fn share_a_clock(result: &RunResult, crossing: &Crossing<'_>) -> bool {
     let index_of = |host: &str| nic_of(result, host).and_then(|card| card.phc_index);
     let from = index_of(&crossing.from_host.name);
     result.has_one_clock && from.is_some() && from == index_of(&crossing.to_host.name)

@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
 
-use hil_account::radio::{RadioMetrics, transmit_stamps};
+use hil_account::radio::RadioMetrics;
 use hil_core::record::UNAVAILABLE;
 use hil_core::time::Instant;
 
@@ -31,8 +31,6 @@ pub(super) fn add(
         if topology.crossing(channel).is_some() {
             report.channels.push(ChannelRadio {
                 channel: channel.name.clone(),
-                transmit_stamps: records
-                    .consult(channel, |files, _| files.egress.map(transmit_stamps)),
                 acknowledgements: acknowledgements.remove(&channel.name),
             });
         }

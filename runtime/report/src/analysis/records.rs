@@ -269,9 +269,6 @@ impl<'a> RunRecords<'a> {
         let is_witnessed =
             |process: &str| topology.process(process).is_some_and(Process::is_witnessed);
         let crossing = topology.crossing(channel);
-        let cards_share_clock = crossing
-            .as_ref()
-            .is_some_and(|crossing| super::nics::share_a_clock(result, crossing));
         let path = if crossing.is_some() {
             let host_of = |process: Option<&str>| Some(&topology.process(process?)?.host);
             let hosts = host_of(Some(&channel.from)).zip(host_of(channel.to.as_deref()));
@@ -311,7 +308,6 @@ impl<'a> RunRecords<'a> {
                 FirstNumber::Zero
             },
             has_witness: channel.to.as_deref().is_some_and(is_witnessed),
-            cards_share_clock,
             round_trips_ns: &round_trips_ns,
             ..AccountContext::new(path)
         };

@@ -5,7 +5,7 @@ use hil_stats::comparison::Estimate;
 
 use super::*;
 use crate::answer::{Hurt, Object};
-use crate::compare::Verdict;
+use crate::compare::{Tested, Verdict};
 
 fn figure(metric: &str, kind: ChartKind, [low, value, high]: [f64; 3]) -> ComparedMetric {
     let interval = Some(Interval::new(low, high, IntervalMethod::EffectiveRanks));
@@ -45,6 +45,8 @@ fn comparison() -> Comparison {
         headline: Vec::new(),
         base: Vec::new(),
         new: Vec::new(),
+        base_tested: Tested::default(),
+        new_tested: Tested::default(),
         same: Vec::new(),
         differences: Vec::new(),
         cautions: Vec::new(),

@@ -3,6 +3,7 @@
 
 use hil_core::interval::{Interval, Spread, TooSmall};
 use hil_stats::comparison::{Estimate, difference, mean_interval, none_of, welch};
+use hil_stats::dependence::COUNT_MIN;
 use hil_stats::statistics::CONFIDENCE;
 use serde::Serialize;
 
@@ -80,7 +81,7 @@ impl RunHarm {
         })
     }
 
-    /// With its interval; without events that of how they come together in the `other` run.
+    /// With its interval; without events that of how they come together in the `other` run, or why that is unknown.
     fn estimate(&self, other: &Self) -> Result<Estimate, TooSmall> {
         let value = self.value;
         let with = |interval| Estimate {
@@ -98,8 +99,21 @@ impl RunHarm {
                 let found = counts.and_then(|(of, like_of)| none_of(of, like, like_of));
                 found.map(with).ok_or(why)
             }
+            (Spread::Unknown(_), Spread::Unknown(why)) if value == 0.0 && other.value > 0.0 => {
+                Err(why)
+            }
             (Spread::Unknown(why), _) => Err(why),
         }
+    }
+
+    /// The same beside several runs, by that of them which leaves open the most.
+    fn against(&self, others: &[Self]) -> Result<Estimate, TooSmall> {
+        let hurt = others.iter().filter(|one| one.value > 0.0);
+        let found = hurt.map(|other| self.estimate(other));
+        let found = found.collect::<Result<Vec<_>, _>>()?;
+        let high = |one: &Estimate| one.interval.map_or(f64::INFINITY, |found| found.high);
+        let widest = found.into_iter().max_by(|a, b| high(a).total_cmp(&high(b)));
+        widest.map_or_else(|| self.estimate(self), Ok)
     }
 }
 
@@ -118,10 +132,10 @@ impl HarmDifference {
         };
         let found = match (base, new) {
             ([b], [n]) => b
-                .estimate(n)
-                .and_then(|one| Ok(difference(one, n.estimate(b)?))),
-            ([b], _) => b.estimate(b).map(|one| difference(one, several(new))),
-            (_, [n]) => n.estimate(n).map(|one| difference(several(base), one)),
+                .against(new)
+                .and_then(|one| Ok(difference(one, n.against(base)?))),
+            ([b], _) => b.against(new).map(|one| difference(one, several(new))),
+            (_, [n]) => n.against(base).map(|one| difference(several(base), one)),
             _ => Ok(welch(&values(base), &values(new), CONFIDENCE)),
         };
         // No share is above one, whatever repetitions scatter.
@@ -240,18 +254,38 @@ pub(super) fn hurt(harms: &[ComparedHarm], base: &[ComparedRun], new: &[Compared
         && harms
             .iter()
             .all(|one| one.change == Change::Less || one.new.count == Some(0));
-    let message_count = new.iter().map(|run| tested_count(&run.summary)).sum();
-    let new_harms = harms.iter().map(|one| &one.new);
     if !is_unhurt && !is_less {
-        return not_resolvable(too_small(harms).unwrap_or(Unresolved::WithinChance));
+        let are_repeated = base.len().min(new.len()) > 1;
+        let because = too_small(harms, are_repeated).unwrap_or(Unresolved::WithinChance);
+        return not_resolvable(because);
     }
-    let Some(mut because) = too_few_occasions(new_harms, message_count) else {
-        return Hurt::No;
+    too_few(harms, base, new).map_or(Hurt::No, not_resolvable)
+}
+
+/// The new runs have too few occasions for a NO. Where a side has one run, each new one must have as many as an interval of
+/// its own takes: with fewer a YES could not be either.
+fn too_few(
+    harms: &[ComparedHarm],
+    base: &[ComparedRun],
+    new: &[ComparedRun],
+) -> Option<Unresolved> {
+    let (mut because, of) = if base.len().min(new.len()) > 1 {
+        let message_count = new.iter().map(|run| tested_count(&run.summary)).sum();
+        let new_harms = harms.iter().map(|one| &one.new);
+        let because = too_few_occasions(new_harms, message_count, OCCASIONS_MIN)?;
+        (because, "the new runs")
+    } else {
+        let because = new.iter().find_map(|run| {
+            let message_count = tested_count(&run.summary);
+            too_few_occasions(&run.summary.harms, message_count, COUNT_MIN)
+        })?;
+        (because, "a new run")
     };
     if let Unresolved::SampleTooSmall { what, .. } = &mut because {
-        what.push_str(" in the new runs");
+        what.push_str(" in ");
+        what.push_str(of);
     }
-    not_resolvable(because)
+    Some(because)
 }
 
 /// What a run alone has to say before its harms are looked at.
@@ -273,14 +307,15 @@ fn base_precondition(run: &ComparedRun) -> Option<Hurt> {
 }
 
 /// The first harm of the new runs whose difference has no interval.
-fn too_small(harms: &[ComparedHarm]) -> Option<Unresolved> {
+fn too_small(harms: &[ComparedHarm], are_repeated: bool) -> Option<Unresolved> {
     let mut hurt = harms.iter().filter(|one| one.new.count != Some(0));
-    hurt.find_map(|one| match one.difference?.interval {
-        Spread::Known(_) => None,
-        Spread::Unknown(why) => Some(Unresolved::NoInterval {
-            what: one.new.what.clone(),
-            why,
-        }),
+    hurt.find_map(|one| {
+        let what = one.new.what.clone();
+        match one.difference?.interval {
+            Spread::Known(_) => None,
+            Spread::Unknown(_) if are_repeated => Some(Unresolved::NoScatter { what }),
+            Spread::Unknown(why) => Some(Unresolved::NoInterval { what, why }),
+        }
     })
 }
 
@@ -288,9 +323,11 @@ fn too_small(harms: &[ComparedHarm]) -> Option<Unresolved> {
 mod tests {
     use std::path::PathBuf;
 
+    use hil_core::random::RandomStream;
     use hil_stats::dependence::Batches;
 
     use super::*;
+    use crate::answer::Object;
     use crate::summary::{LinkKind, Outcome, RunSummary};
     use crate::tests::sample::full;
     use crate::tests::sample_events::recorded_channel;
@@ -342,8 +379,8 @@ mod tests {
         let because = Unresolved::NoInterval {
             what: "motion loops lost".to_owned(),
             why: TooSmall {
-                effective: 0,
-                needed: 5,
+                effective: 284,
+                needed: 3000,
             },
         };
         assert_eq!(chance, Hurt::NotResolvable { because });
@@ -374,6 +411,84 @@ mod tests {
             of(&clean, &repeated)[0].new.words().split(':').next(),
             Some("12 of 480 motion loops sent")
         );
+    }
+
+    #[test]
+    fn single_runs_get_a_no_only_where_they_could_get_a_yes() {
+        let of = |base: u64, new: u64| {
+            compared(&[run(Some(base), 17)], &[run(Some(new), 17)]).words(Object::Robot)
+        };
+        let hurt = "CANNOT TELL: the difference of motion loops lost has no interval: as good as 17 independent ones, 64 needed";
+        assert_eq!(of(0, 11), hurt);
+        let unhurt = "CANNOT TELL: the sample is too small for a NO (motion loops sent in a new run: 17, needed: 64)";
+        assert_eq!(of(0, 0), unhurt);
+        assert_eq!(of(11, 0), unhurt);
+        // Repetitions tell, either way.
+        let runs = |counts: [u64; 3]| counts.map(|count| run(Some(count), 17));
+        assert_eq!(compared(&runs([0; 3]), &runs([11, 9, 12])), Hurt::Yes);
+        assert_eq!(compared(&runs([0; 3]), &runs([0; 3])), Hurt::No);
+        let because = Unresolved::NoScatter {
+            what: "motion loops lost".to_owned(),
+        };
+        let alike = compared(&runs([0; 3]), &runs([3; 3]));
+        assert_eq!(alike, Hurt::NotResolvable { because });
+        assert_eq!(compared(&runs([11, 9, 12]), &runs([0; 3])), Hurt::No);
+        // As do repetitions beside one run that is long enough.
+        let long = |counts: [u64; 3]| counts.map(|count| run(Some(count), 600));
+        assert_eq!(
+            compared(&[run(Some(0), 600)], &long([90, 80, 99])),
+            Hurt::Yes
+        );
+        assert_eq!(compared(&[run(Some(0), 600)], &long([0; 3])), Hurt::No);
+    }
+
+    /// Loops lost while an outage lasts; outages come and go with these mean lengths, in loops.
+    fn clustered(
+        stream: &mut RandomStream,
+        sent_count: u64,
+        [lost, kept]: [f64; 2],
+    ) -> ComparedRun {
+        let (mut runs, mut at, mut is_lost) = (Vec::new(), 0, stream.chance(lost / (lost + kept)));
+        while at < sent_count {
+            let mean = if is_lost { lost } else { kept };
+            let mut length = 1;
+            while !stream.chance(1.0 / mean) {
+                length += 1;
+            }
+            let length = length.min(sent_count - at);
+            if is_lost {
+                runs.push((at, length));
+            }
+            at += length;
+            is_lost = !is_lost;
+        }
+        let mut run = run(Some(runs.iter().map(|one| one.1).sum()), sent_count);
+        let batches = Batches::of_runs(sent_count, runs);
+        run.summary.harms[0].interval = Some(batches.share_interval());
+        run
+    }
+
+    #[test]
+    fn runs_over_one_link_are_seldom_told_apart_however_its_losses_come_together() {
+        for (sent_count, lengths) in [(17, [6.0, 12.0]), (400, [3.0, 60.0]), (400, [6.0, 12.0])] {
+            let run = |seed| {
+                let mut stream = RandomStream::new(seed, "clustered losses");
+                [clustered(&mut stream, sent_count, lengths)]
+            };
+            let runs: Vec<_> = (0..40).map(run).collect();
+            let (mut more_count, mut pair_count) = (0, 0);
+            for (index, base) in runs.iter().enumerate() {
+                for (_, new) in runs.iter().enumerate().filter(|(other, _)| *other != index) {
+                    pair_count += 1;
+                    more_count += usize::from(of(base, new)[0].change == Change::More);
+                }
+            }
+            // More is one of two sides of an interval of 95 %.
+            assert!(
+                more_count * 40 <= pair_count,
+                "{more_count} of {pair_count} at {lengths:?}"
+            );
+        }
     }
 
     #[test]

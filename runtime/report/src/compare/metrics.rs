@@ -324,9 +324,9 @@ impl RunLoss {
         if share.of == 0 {
             return None;
         }
-        let of_network = network_of(run, channel).and_then(|one| one.loss.measured());
         // Of the same messages: the harness may lose some too.
-        let same = of_network.filter(|loss| loss.lost_count == share.count);
+        let same = network_of(run, channel).filter(|one| one.lost_count == share.count);
+        let same = same.and_then(|one| one.loss.measured());
         Some(Self {
             share,
             interval: same.and_then(|loss| loss.interval.known()),
@@ -436,7 +436,7 @@ struct NetworkFigure {
     metric: &'static str,
     kind: ChartKind,
     unit: &'static str,
-    of: fn(&NetworkMetrics) -> Option<f64>,
+    of: fn(&NetworkMetrics, &ChannelAccount) -> Option<f64>,
 }
 
 /// Beside loss and delay: order by RFC 4737, copies by RFC 5560, losses in a row by RFC 3357, and both forms of delay variation
@@ -446,14 +446,14 @@ const NETWORK: [NetworkFigure; 5] = [
         metric: "reordered",
         kind: ChartKind::Loss,
         unit: "1",
-        of: |figures| figures.order.measured().map(|order| order.ratio),
+        of: |figures, _| figures.order.measured().map(|order| order.ratio),
     },
     NetworkFigure {
         metric: "duplicated",
         kind: ChartKind::Loss,
         unit: "1",
-        of: |figures| {
-            let share = figures.duplicated_count? as f64 / figures.arrived_count as f64;
+        of: |figures, account| {
+            let share = account.duplicated_count? as f64 / figures.arrived_count as f64;
             share.is_finite().then_some(share)
         },
     },
@@ -461,7 +461,7 @@ const NETWORK: [NetworkFigure; 5] = [
         metric: "loss_run_max",
         kind: ChartKind::Count,
         unit: "messages",
-        of: |figures| {
+        of: |figures, _| {
             let runs = figures.loss.measured()?.runs.iter();
             Some(runs.map(|one| one.length_messages).max().unwrap_or(0) as f64)
         },
@@ -470,13 +470,13 @@ const NETWORK: [NetworkFigure; 5] = [
         metric: "pdv_p99",
         kind: ChartKind::Delay,
         unit: "ns",
-        of: |figures| Some(figures.delay.measured()?.variation.p99_ns as f64),
+        of: |figures, _| Some(figures.delay.measured()?.variation.p99_ns as f64),
     },
     NetworkFigure {
         metric: "ipdv_p99",
         kind: ChartKind::Delay,
         unit: "ns",
-        of: |figures| Some(figures.successive.measured()?.p99_ns as f64),
+        of: |figures, _| Some(figures.successive.measured()?.p99_ns as f64),
     },
 ];
 
@@ -493,8 +493,10 @@ fn network(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
         } in &NETWORK
         {
             let side = |runs: &[ComparedRun]| -> Vec<Estimate> {
-                let channels = |run| network_of(run, &channel);
-                let found = runs.iter().filter_map(|run| value(channels(run)?));
+                let found = runs.iter().filter_map(|run| {
+                    let (_, account) = accounts(run).find(|(name, _)| *name == channel)?;
+                    value(network_of(run, &channel)?, account)
+                });
                 found
                     .map(|value| Estimate {
                         value,

@@ -10,6 +10,7 @@ mod origin;
 mod render;
 pub mod work;
 
+use std::collections::BTreeSet;
 use std::fmt;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -21,6 +22,7 @@ use serde::Serialize;
 
 use crate::answer::{Hurt, Object};
 use crate::sections::events::gravest_harm;
+use crate::sections::{link_words, transports};
 use crate::summary::{RunSummary, SummaryError};
 use harms::ComparedHarm;
 use hil_rundir::manifest::Manifest;
@@ -195,6 +197,29 @@ pub(crate) struct Measurements {
     pub(crate) words: String,
 }
 
+/// What the runs of a side were.
+#[derive(Debug, Clone, Default, Serialize)]
+pub(crate) struct Tested {
+    /// What their emulated links do, or over what their channels went, each once.
+    pub(crate) links: Vec<String>,
+    /// Their lengths together, seconds.
+    pub(crate) duration_s: f64,
+}
+
+impl Tested {
+    fn of(runs: &[ComparedRun]) -> Self {
+        let links = runs.iter().flat_map(|run| {
+            let emulated = link_words(&run.summary).into_iter();
+            let others = transports(&run.summary).into_iter();
+            emulated.chain(others.map(str::to_owned))
+        });
+        Self {
+            links: links.collect::<BTreeSet<_>>().into_iter().collect(),
+            duration_s: runs.iter().map(|run| run.summary.run.duration_s).sum(),
+        }
+    }
+}
+
 /// All of it.
 #[derive(Debug, Clone, Serialize)]
 pub(crate) struct Comparison {
@@ -202,6 +227,10 @@ pub(crate) struct Comparison {
     pub(crate) base: Vec<PathBuf>,
     /// Folders of the new runs.
     pub(crate) new: Vec<PathBuf>,
+    /// What those of the base were.
+    pub(crate) base_tested: Tested,
+    /// What the new ones were.
+    pub(crate) new_tested: Tested,
     /// What both sides have in common that matters.
     pub(crate) same: Vec<String>,
     /// In what the runs differ beside the figures; empty when in nothing that is known.
@@ -242,6 +271,8 @@ impl Comparison {
         Self {
             base: folders(base),
             new: folders(new),
+            base_tested: Tested::of(base),
+            new_tested: Tested::of(new),
             same,
             differences,
             cautions,

@@ -8,21 +8,23 @@ use hil_platform::words::counted;
 use hil_present::template::{TemplateError, markdown as document};
 use hil_present::terminal::canvas::{Canvas, Style};
 use hil_present::terminal::section;
-use hil_present::units::{self, duration, percent};
+use hil_present::units::{self, JOINT, duration, percent};
 use hil_present::{Block, Section, Table, Tone, UNAVAILABLE};
 use hil_stats::comparison::Estimate;
 
 use super::conditions::Verdicts;
 use super::harms::HarmDifference;
 use super::origin::{Difference, Differing};
-use super::{ChartKind, ComparedMetric, Comparison, Part, Verdict};
-use crate::answer::{Hurt, Object, with_note};
+use super::{ChartKind, ComparedMetric, Comparison, Part, Tested, Verdict};
+use crate::answer::{Hurt, Object, OccasionCount, Unresolved, none_means, with_note};
 use crate::summary::ScoreMetric;
 
 const COLUMNS: [&str; 6] = ["metric", "base", "new", "new / base", "95 %", "verdict"];
 /// Differences and channels that are listed unless every metric is asked for.
 const DIFFERENCES_SHOWN: usize = 8;
 const CHANNELS_SHOWN: usize = 12;
+/// Repetitions a side that are asked for.
+const REPETITIONS_MIN: usize = 3;
 
 /// How much is shown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -168,6 +170,15 @@ fn harms(comparison: &Comparison) -> Section {
             section.fact("new less base", Tone::Plain, difference_words(difference));
         }
     }
+    if comparison.hurt == Hurt::No {
+        let unhurt = comparison.harms.iter().map(|one| &one.new);
+        for harm in unhurt.filter(|one| one.count == Some(0)) {
+            let means = harm.occasions.iter();
+            for OccasionCount { what, count } in means {
+                section.fact("NO means", Tone::Plain, none_means(what, *count));
+            }
+        }
+    }
     if let Some(words) = &comparison.gravest_harm {
         section.fact("gravest harm", Tone::Plain, words);
     }
@@ -186,7 +197,56 @@ fn harms(comparison: &Comparison) -> Section {
         let label = if index == 0 { "left open" } else { "" };
         section.fact(label, Tone::Plain, words);
     }
+    tested(&mut section, comparison);
+    resolve(&mut section, comparison);
     section
+}
+
+/// Over what the runs went, and how long they were.
+fn tested(section: &mut Section, comparison: &Comparison) {
+    let (base, new) = (&comparison.base_tested, &comparison.new_tested);
+    let links = |of: &Tested| match of.links.as_slice() {
+        [] => "none".to_owned(),
+        all => all.join(" or "),
+    };
+    if base.links == new.links {
+        section.fact("link", Tone::Plain, links(base));
+    } else {
+        section.fact("link of the base", Tone::Plain, links(base));
+        section.fact("link of the new", Tone::Plain, links(new));
+    }
+    let sample = |runs: &[PathBuf], of: &Tested| {
+        let length = format!("{:.1}{JOINT}s", of.duration_s);
+        match runs.len() as u64 {
+            1 => format!("1 run of {length}"),
+            count => format!("{} of {length} together", counted(count, "run")),
+        }
+    };
+    let (base, new) = (sample(&comparison.base, base), sample(&comparison.new, new));
+    section.fact("sample", Tone::Plain, format!("base {base}, new {new}"));
+}
+
+/// What would make an answer of a sample that is too small.
+fn resolve(section: &mut Section, comparison: &Comparison) {
+    let Hurt::NotResolvable {
+        because:
+            Unresolved::SampleTooSmall { .. } | Unresolved::NoInterval { .. } | Unresolved::WithinChance,
+    } = &comparison.hurt
+    else {
+        return;
+    };
+    let words = if comparison.base.len().min(comparison.new.len()) < REPETITIONS_MIN {
+        format!(
+            "repeat the runs of both sides, each with a seed of its own, until there are \
+             {REPETITIONS_MIN} a side or more:"
+        )
+    } else {
+        "more repetitions on both sides, each with a seed of its own:".to_owned()
+    };
+    section.fact("to resolve it", Tone::Plain, words);
+    section.blocks.push(Block::Command {
+        text: "hil-runtime compare --base BASE-RUNS --new NEW-RUNS".to_owned(),
+    });
 }
 
 fn difference_words(of: &HarmDifference) -> String {
@@ -211,16 +271,6 @@ fn more_words(of: &HarmDifference, value: f64) -> String {
 /// What the runs do not tell.
 fn left_open(comparison: &Comparison) -> Vec<String> {
     let mut open = Vec::new();
-    if comparison.hurt == Hurt::No {
-        for one in &comparison.harms {
-            let of = one.difference.as_ref();
-            let ends = of.and_then(|of| Some((of, of.interval.known()?)));
-            if let Some((of, Interval { high, .. })) = ends.filter(|(_, one)| one.high > 0.0) {
-                let most = more_words(of, high);
-                open.push(format!("{}: up to {most} would not show", one.base.what));
-            }
-        }
-    }
     if comparison.base.len().min(comparison.new.len()) == 1 {
         open.push("how much runs differ by themselves: one run on a side".to_owned());
     }
@@ -260,7 +310,11 @@ fn judged(verdicts: &Verdicts) -> Section {
 
 /// Every metric.
 fn metrics(comparison: &Comparison) -> Section {
-    let mut section = Section::new("metrics", "Metrics", "intervals are 95 %");
+    let mut section = Section::new(
+        "metrics",
+        "Metrics",
+        "intervals are 95 %; loss of the messages of known fate",
+    );
     let is_of_one = |one: &ComparedMetric, other: &ComparedMetric| one.channel == other.channel;
     for figures in comparison.figures.chunk_by(is_of_one) {
         let title = figures[0].channel.as_deref().unwrap_or("scores");
@@ -475,7 +529,7 @@ fn channels(comparison: &Comparison) -> Section {
         .into_iter()
         .filter(|one| is_shown(one))
         .collect();
-    let mut columns = vec!["channel", "lost"];
+    let mut columns = vec!["channel", "lost, of known fate"];
     columns.extend(&seldom);
     columns.extend(["p50, new / base", "p99, new / base"]);
     let mut table = Table::new("", &columns);

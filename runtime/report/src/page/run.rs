@@ -203,10 +203,6 @@ fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
             .into_iter()
             .chain(facts.rest)
             .map(field)
-            .chain(summary.run.links.iter().map(|link| {
-                let value = format!("{}: {}", link.label, link.value);
-                Field::new("emulated link", value)
-            }))
             .collect(),
     }
 }
@@ -221,7 +217,10 @@ fn has_a_hundredth(channel: &Section) -> bool {
 
 /// Figures of which the channel with the largest is shown first, and what they are called.
 pub(super) const WORST: [(&str, &str); 3] = [
-    ("loss_ratio", "largest loss by the network"),
+    (
+        "loss_ratio",
+        "largest loss by the network, of what it was given",
+    ),
     ("p99", "largest p99"),
     ("network_p99", "network's largest p99"),
 ];

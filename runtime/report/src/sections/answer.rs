@@ -1,5 +1,7 @@
 //! What stands below the answer of a run, in every form. It draws no conclusions.
 
+use std::collections::BTreeSet;
+
 use hil_core::interval::Spread;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
@@ -10,7 +12,7 @@ use super::demand;
 use super::events::gravest_harm;
 use crate::answer::{Answer, HarmCount, Hurt, OCCASIONS_MIN, with_note};
 use crate::assessment::Assessment;
-use crate::summary::RunSummary;
+use crate::summary::{LinkKind, RunSummary};
 use hil_core::case_study::Severity;
 
 /// What an answer rests on, in the order of reading.
@@ -57,8 +59,8 @@ impl AnswerFacts {
         }
         if answer.hurt == Hurt::No {
             harms.extend(near_misses(summary).map(|words| Field::new("near misses", words)));
-            let open = answer.left_open();
-            harms.extend(open.map(|words| Field::new("left open", words)));
+            let means = answer.no_means();
+            harms.extend(means.map(|words| Field::new("NO means", words)));
         }
         let mut rest = Vec::new();
         rest.extend(messages(summary).map(|words| Field::new("messages", words)));
@@ -75,7 +77,13 @@ impl AnswerFacts {
         let mut intervals = harms_of.chain(headline.iter().map(|one| one.interval));
         let has_interval = intervals.any(|one| matches!(one, Some(Spread::Known(_))));
         let note = if has_interval { "; brackets: 95 %" } else { "" };
-        let words = format!("{}{note}", answer.sample_words());
+        let links = link_words(summary);
+        let over = match transports(summary).as_slice() {
+            [] => String::new(),
+            all => format!(" over {}", all.join(" and ")),
+        };
+        rest.extend(links.map(|words| Field::new("emulated link", words)));
+        let words = format!("{}{over}{note}", answer.sample_words());
         rest.push(Field::new("sample", words));
         Self {
             measurement: Field::toned("measurement", tone, validity),
@@ -83,6 +91,29 @@ impl AnswerFacts {
             rest,
         }
     }
+}
+
+/// Emulated links that are named; all are in `summary.json`.
+const LINKS_SHOWN: usize = 3;
+
+/// What the emulated links do; `None` without one.
+pub(crate) fn link_words(summary: &RunSummary) -> Option<String> {
+    let all = &summary.run.links;
+    let shown = all.iter().take(LINKS_SHOWN).map(ToString::to_string);
+    let mut words: Vec<String> = shown.collect();
+    let hidden = all.len().saturating_sub(LINKS_SHOWN) as u64;
+    if hidden > 0 {
+        words.push(format!("{} more in summary.json", grouped(hidden)));
+    }
+    (!words.is_empty()).then(|| words.join("; "))
+}
+
+/// Over what channels crossed a network, each once.
+pub(crate) fn transports(summary: &RunSummary) -> Vec<&'static str> {
+    let links = summary.channels.iter().map(|one| one.link);
+    let crossed = links.filter(|link| matches!(link, LinkKind::Network(_)));
+    let labels: BTreeSet<&str> = crossed.map(LinkKind::label).collect();
+    labels.into_iter().collect()
 }
 
 /// Hazards of a robot that was not hurt: how many, and the first; `None` without a robot.
@@ -129,7 +160,8 @@ fn messages(summary: &RunSummary) -> Option<String> {
         }
         _ if all == 0 => "none lost".to_owned(),
         Some((name, lost, of)) if *lost > 0 => {
-            format!("up to {} lost, on {name}", percent(ratio(*lost, *of)))
+            let share = percent(ratio(*lost, *of));
+            format!("up to {share} of those published lost, on {name}")
         }
         _ => format!("{} lost", grouped(all)),
     };

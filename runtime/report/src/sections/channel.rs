@@ -121,7 +121,8 @@ fn channel(one: &ChannelSummary, summary: &RunSummary) -> Section {
     if let Some(network) = sources.network {
         network_facts(&mut section, network);
     }
-    radio::channel(&mut section, summary.radio.channel(&one.name));
+    let stamped = one.account.as_ref().map(|account| &account.coverage);
+    radio::channel(&mut section, stamped, summary.radio.channel(&one.name));
     if let Some(emulation) = &one.emulation {
         self::emulation(&mut section, emulation);
     }
@@ -238,7 +239,7 @@ fn network_facts(section: &mut Section, network: &NetworkMetrics) {
         let (tone, text) = bound_words(delay);
         section.fact("clocks", tone, text);
     }
-    if let Some(loss) = network.loss.measured().filter(|loss| loss.lost_count > 0) {
+    if let Some(loss) = network.loss.measured().filter(|_| network.lost_count > 0) {
         section.fact("losses", Tone::Plain, loss_runs_words(loss));
     }
     let aside = [
@@ -359,7 +360,11 @@ fn loss_ratio(network: Option<&NetworkMetrics>) -> Metric {
     match &network.loss {
         Measured::Measured(loss) => {
             let metric = Metric::new("loss_ratio", "lost by the network", "share", loss.ratio);
-            let mut method = format!("{} of {}", grouped(loss.lost_count), grouped(loss.of_count));
+            let mut method = format!(
+                "{} of {}",
+                grouped(network.lost_count),
+                grouped(network.offered_count)
+            );
             // Why there is none stands beside the value.
             if loss.interval.known().is_some() {
                 method = format!("{method}; {}", loss.interval);
@@ -395,8 +400,7 @@ fn order(sources: &Sources<'_>) -> Vec<Metric> {
     let arrived = sources.network.map(|one| one.arrived_count);
     let late = account.and_then(|one| one.late_count);
     let network = sources.network;
-    let duplicated = network.and_then(|one| one.duplicated_count);
-    let duplicated = duplicated.or_else(|| account?.duplicated_count);
+    let duplicated = account.and_then(|one| one.duplicated_count);
     let reordered = network.and_then(|one| Some(one.order.measured()?.reordered_count));
     let reordered = reordered.or_else(|| account?.reordered_count);
     let mut figures = Vec::new();
@@ -501,7 +505,7 @@ fn end_to_end(sources: &Sources<'_>) -> Vec<Metric> {
                 figure("p999", "p99.9", summary.p999_ns, None),
                 figure("max", "largest", summary.max_ns, None),
             ];
-            if let Some(bound_ns) = whole.alignment_bound_ns.filter(|bound_ns| *bound_ns > 0) {
+            if let Some(bound_ns) = whole.alignment_bound_ns().filter(|bound_ns| *bound_ns > 0) {
                 let bound = Metric::new(
                     "clock_bound",
                     "off by the clocks, at most",
@@ -519,8 +523,7 @@ fn end_to_end(sources: &Sources<'_>) -> Vec<Metric> {
 fn network(sources: &Sources<'_>) -> Vec<Metric> {
     let Some(network) = sources.network else {
         let mut all = ONE_WAY.unavailable(NO_NETWORK);
-        let round_trips = sources.account.map(|account| &account.round_trip);
-        all.extend(round_trips.into_iter().flat_map(round_trip));
+        all.extend(round_trips(sources.account));
         return all;
     };
     let kind = if sources.link == Some(LinkKind::Emulated) {
@@ -533,12 +536,7 @@ fn network(sources: &Sources<'_>) -> Vec<Metric> {
         Measured::Measured(delay) => one_way(delay, kind),
     };
     all.extend(successive(&network.successive));
-    let of_account = sources.account.map(|account| &account.round_trip);
-    let is_measured = network.round_trip.measured().is_some();
-    let found = of_account
-        .filter(|_| !is_measured)
-        .unwrap_or(&network.round_trip);
-    all.extend(round_trip(found));
+    all.extend(round_trips(sources.account));
     let too_few = "fewer than two messages";
     for (name, label, unit, value) in [
         (
@@ -666,14 +664,17 @@ fn successive(found: &Measured<SuccessiveVariation>) -> Vec<Metric> {
     .collect()
 }
 
-fn round_trip(found: &Distribution) -> Vec<Metric> {
+fn round_trips(account: Option<&ChannelAccount>) -> Vec<Metric> {
     const NAMES: [(&str, &str); 4] = [
         ("round_trip_p50", "round trip of the gateways, p50"),
         ("round_trip_p99", "round trip of the gateways, p99"),
         ("round_trip_p999", "round trip of the gateways, p99.9"),
         ("round_trip_max", "round trip of the gateways, largest"),
     ];
-    match found {
+    let Some(account) = account else {
+        return Vec::new();
+    };
+    match &account.round_trip {
         Distribution::Unavailable { reason } => NAMES
             .map(|(name, label)| Metric::unavailable(name, label, "s", reason))
             .to_vec(),
@@ -832,11 +833,8 @@ fn segment_table(account: &ChannelAccount) -> Table {
         rows.push(row);
         start = end;
     }
-    if let Some(hardware) = &account.hardware_wire {
-        rows.push(segment_row("card to card", hardware, None));
-    }
     let whole = &account.end_to_end;
-    let bound = whole.alignment_bound_ns;
+    let bound = whole.alignment_bound_ns();
     let mut row = segment_row("published → taken", &whole.distribution, bound);
     row.tone = Tone::Strong;
     rows.push(row);

@@ -2,6 +2,7 @@
 
 use core::cmp::Reverse;
 
+use hil_account::MessageFate;
 use hil_account::network::NetworkEventKind;
 use hil_core::case_study::Severity;
 use hil_platform::text::grouped;
@@ -9,7 +10,7 @@ use hil_platform::words::counted;
 use hil_present::units::{duration_s, percent, seconds};
 use hil_present::{Block, Event, EventList, Section, Tone, UNAVAILABLE};
 
-use crate::answer::Evidence;
+use crate::answer::{CHANCE_MAX, Evidence};
 use crate::network::{NetworkReport, PrecedingNetwork, TimedEvent};
 use crate::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
 use crate::summary::RunSummary;
@@ -23,23 +24,31 @@ const NETWORK_SHOWN_COUNT: usize = 3;
 const NETWORK_EVENTS_MAX: usize = 40;
 
 /// What is said of a robot to which nothing happened.
-pub(crate) const NOTHING_GRAVE: &str = "no incident and no hazard";
+const NOTHING_GRAVE: &str = "no incident and no hazard";
+
+/// The head of what happened to the robot; whether there is more to say of its events, of which `count` are to be listed.
+pub(crate) fn robot_head(summary: &RunSummary, title: &str, count: u64) -> (Section, bool) {
+    let mut section = Section::new("robot", title, "");
+    if summary.run.case.is_empty() {
+        return (section, false);
+    }
+    if let Some(words) = summary.no_score_words() {
+        section.note(Tone::Caution, words);
+        return (section, false);
+    }
+    section.aside = severity_counts(&summary.score_events);
+    if count == 0 {
+        section.note(Tone::Plain, NOTHING_GRAVE);
+    }
+    (section, count > 0)
+}
 
 /// What happened to the robot, the gravest events where there are too many, in order of time.
 pub(super) fn robot(summary: &RunSummary) -> Section {
     let title = "What happened to the robot, and the network before it";
     let all = &summary.score_events;
-    let mut section = Section::new("robot", title, "");
-    if summary.run.case.is_empty() {
-        return section;
-    }
-    if let Some(words) = summary.no_score_words() {
-        section.note(Tone::Faint, words);
-        return section;
-    }
-    section.aside = severity_counts(all);
-    if all.total_count() == 0 {
-        section.note(Tone::Plain, NOTHING_GRAVE);
+    let (mut section, has_events) = robot_head(summary, title, all.total_count());
+    if !has_events {
         return section;
     }
     if all.clocks_differ {
@@ -92,7 +101,7 @@ fn dropped_words(all: &ScoreEvents) -> Option<String> {
 }
 
 /// How many there are of each severity, listed or not.
-pub(crate) fn severity_counts(all: &ScoreEvents) -> String {
+fn severity_counts(all: &ScoreEvents) -> String {
     format!(
         "{} (must not happen), {} (nearly one), {}",
         counted(all.count_of(Severity::Incident), "incident"),
@@ -172,9 +181,10 @@ fn message(message: &ExplainedMessage) -> String {
     format!("{} {number}{at}: {}", message.channel, message.words)
 }
 
-/// The network event that has most to do with `event`.
-pub(crate) fn cause(event: &ExplainedEvent) -> String {
-    // What the network did stands before what a process or a host did.
+/// The network event that has most to do with `event`. Where most moments of the run have one before them, losses as
+/// losses all over the run make them are none: in their place stands what the channel lost then and in the whole run.
+pub(crate) fn cause(event: &ExplainedEvent, report: Option<&NetworkReport>) -> String {
+    // What the network did stands before what a process or a host did; with the messages that it lost in a row.
     let of = |is_meant: fn(bool) -> bool| {
         let mut outages = event.outages.iter();
         let outage = outages.find(|one| is_meant(one.lost_by_network_count > 0));
@@ -185,21 +195,87 @@ pub(crate) fn cause(event: &ExplainedEvent) -> String {
             fate.is_some_and(|fate| is_meant(fate.is_loss_by_network()))
         });
         outage
-            .map(|one| one.words.clone())
-            .or_else(|| Some(beside.next()?.words.clone()))
+            .map(|one| (one.words.clone(), one.lost_by_network_count))
+            .or_else(|| {
+                let one = beside.next()?;
+                let count = match one.event.kind {
+                    NetworkEventKind::Outage { lost_count, .. } => lost_count,
+                    NetworkEventKind::LossBurst { .. } => 1,
+                    _ => 0,
+                };
+                Some((one.words.clone(), count))
+            })
             .or_else(|| {
                 let lost = lost.next()?;
                 let number = grouped(lost.sequence);
-                Some(format!("{} {number}: {}", lost.channel, lost.words))
+                let is_by_network = lost.fate.is_some_and(MessageFate::is_loss_by_network);
+                let words = format!("{} {number}: {}", lost.channel, lost.words);
+                Some((words, u64::from(is_by_network)))
             })
     };
     let found = of(|is_network| is_network).or_else(|| of(|_| true));
-    found.unwrap_or_else(|| {
-        event.network.as_ref().map_or_else(
+    let usual = report.and_then(|report| UsualLosses::of(event, report));
+    match (found, usual) {
+        (None, Some(usual)) => usual.words,
+        (Some((_, count)), Some(usual)) if usual.make(count) => usual.words,
+        (Some((words, _)), _) => words,
+        (None, None) => event.network.as_ref().map_or_else(
             || "nothing is known of the network".to_owned(),
             PrecedingNetwork::nothing_words,
-        )
-    })
+        ),
+    }
+}
+
+/// What a channel loses all over a run.
+struct UsualLosses {
+    /// Of the whole run.
+    ratio: f64,
+    /// Messages before the event.
+    sent_count: u64,
+    /// What it lost before the event, and in the whole run.
+    words: String,
+}
+
+impl UsualLosses {
+    /// Those of the channel that `event` concerns most, in a run most of whose moments have a network event before them.
+    fn of(event: &ExplainedEvent, report: &NetworkReport) -> Option<Self> {
+        let network = event.network.as_ref()?;
+        if report.foregoing_chance_ratio <= CHANCE_MAX {
+            return None;
+        }
+        let missing = event.messages.iter().filter(|one| {
+            let fate = one.fate;
+            fate.is_some_and(MessageFate::is_loss_by_network)
+        });
+        let outages = event.outages.iter();
+        let outages = outages.filter(|one| one.lost_by_network_count > 0);
+        let named = missing.map(|one| &one.channel);
+        let mut named = named.chain(outages.map(|one| &one.channel));
+        let mut losses = network.losses.iter();
+        let loss = match named.next() {
+            Some(channel) => losses.find(|one| one.channel == *channel)?,
+            None => losses.next()?,
+        };
+        let mut channels = report.channels.iter();
+        let channel = channels.find(|one| one.channel == loss.channel)?;
+        let ratio = channel.figures.loss.measured()?.ratio;
+        let [share, whole] = [loss.ratio(), ratio].map(percent);
+        let window = duration_s(network.foregoing_s);
+        Some(Self {
+            ratio,
+            sent_count: loss.sent_count,
+            words: format!(
+                "losses all along: {} lost {share} in the {window} before, {whole} in the whole run",
+                loss.channel
+            ),
+        })
+    }
+
+    /// Whether independent losses of the same share make a row of `count` in the same time.
+    fn make(&self, count: u64) -> bool {
+        let expected = self.sent_count as f64 * (1.0 - self.ratio) * self.ratio.powf(count as f64);
+        count > 0 && expected >= 1.0
+    }
 }
 
 /// Incidents, then hazards, each in order of time.
@@ -216,7 +292,8 @@ pub(crate) fn gravest_harm(summary: &RunSummary) -> Option<(String, String)> {
     let mut gravest = gravest_first(&summary.score_events.events).into_iter();
     let event = gravest.find(|event| evidence.explains(event))?;
     let at = event.at_s.map(|at_s| format!("at {}: ", seconds(at_s)));
-    Some((at.unwrap_or_default() + &event.what, cause(event)))
+    let cause = cause(event, summary.network.as_ref());
+    Some((at.unwrap_or_default() + &event.what, cause))
 }
 
 /// What happened on the network, the longest events.

@@ -14,7 +14,7 @@ mod radio;
 mod run;
 mod timeline;
 
-pub(crate) use answer::AnswerFacts;
+pub(crate) use answer::{AnswerFacts, link_words, transports};
 pub(crate) use channel::Sources;
 pub use channel::quantile_table;
 pub(crate) use flows::{deadlines, flows};

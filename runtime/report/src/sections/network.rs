@@ -20,7 +20,8 @@ const PAIRS_SHOWN_COUNT: usize = 6;
 
 /// A line a channel.
 pub(super) fn network(report: &NetworkReport) -> Section {
-    let aside = "from the hand-over to the kernel to the receiving gateway";
+    let aside =
+        "from the hand-over to the kernel to the receiving gateway; loss of what was handed over";
     let mut section = Section::new("network", "Network", aside);
     let columns = [
         "channel",

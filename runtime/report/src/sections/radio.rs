@@ -1,6 +1,7 @@
 //! What a report says of radios. It returns nothing on a wired run whose drivers stamp departures.
 
-use hil_account::radio::{RadioMetrics, Share, TransmitStampMetrics};
+use hil_account::radio::{RadioMetrics, Share};
+use hil_account::{Coverage, StampCoverage};
 
 use hil_present::units::percent;
 use hil_present::{Section, Tone};
@@ -9,31 +10,38 @@ use crate::radio::{ChannelRadio, RadioHopSummary, RadioReport, Spread, StationSu
 use hil_platform::text::grouped;
 
 /// Beside a channel's account: where it was stamped, and what the radio reported.
-pub(super) fn channel(section: &mut Section, radio: Option<&ChannelRadio>) {
-    let Some(radio) = radio else { return };
-    if let Some(text) = radio.transmit_stamps.as_ref().and_then(stamp_words) {
+pub(super) fn channel(
+    section: &mut Section,
+    stamped: Option<&StampCoverage>,
+    radio: Option<&ChannelRadio>,
+) {
+    if let Some(text) = stamped.and_then(stamp_words) {
         section.fact("TX stamp", Tone::Caution, text);
     }
-    if let Some(figures) = &radio.acknowledgements {
+    if let Some(figures) = radio.and_then(|one| one.acknowledgements.as_ref()) {
         acknowledgements(section, figures);
     }
 }
 
 /// Where stamps were taken, unless all are departures.
-fn stamp_words(figures: &TransmitStampMetrics) -> Option<String> {
-    let of = |count: u64| format!("{} of {}", grouped(count), grouped(figures.handed_count));
+fn stamp_words(stamped: &StampCoverage) -> Option<String> {
+    let Coverage {
+        stamped_count,
+        eligible_count,
+    } = stamped.tx_software?;
+    let of = |count: u64| format!("{} of {}", grouped(count), grouped(eligible_count));
     let mut words = Vec::new();
-    if figures.before_queue_count > 0 {
+    if stamped.tx_before_queue_count > 0 {
         words.push(format!(
             "before the queue for {} messages: this driver stamps no departures, so \"TX stamp → \
              RX stamp\" holds what they waited in the queue and the driver",
-            of(figures.before_queue_count)
+            of(stamped.tx_before_queue_count)
         ));
     }
-    if figures.application_count > 0 && figures.departure_count < figures.handed_count {
+    if stamped_count < eligible_count {
         words.push(format!(
             "none for {}: the gateway's own, before the send call, stands in",
-            of(figures.application_count)
+            of(eligible_count - stamped_count)
         ));
     }
     (!words.is_empty()).then(|| words.join("; "))
@@ -185,19 +193,16 @@ mod tests {
 
     #[test]
     fn a_wired_channel_stamped_at_departure_needs_no_line() {
-        let figures = TransmitStampMetrics {
-            handed_count: 9,
-            departure_count: 9,
-            ..TransmitStampMetrics::default()
+        let of = |stamped_count, tx_before_queue_count| StampCoverage {
+            tx_software: Some(Coverage {
+                stamped_count,
+                eligible_count: 9,
+            }),
+            tx_before_queue_count,
+            ..StampCoverage::default()
         };
-        assert_eq!(stamp_words(&figures), None);
-        let fallback = TransmitStampMetrics {
-            handed_count: 9,
-            before_queue_count: 8,
-            application_count: 1,
-            ..TransmitStampMetrics::default()
-        };
-        let words = stamp_words(&fallback).unwrap();
+        assert_eq!(stamp_words(&of(9, 0)), None);
+        let words = stamp_words(&of(8, 8)).unwrap();
         assert!(words.contains("before the queue for 8 of 9"), "{words}");
         assert!(words.contains("none for 1 of 9"), "{words}");
     }

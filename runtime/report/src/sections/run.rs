@@ -28,9 +28,9 @@ const METHOD: [&str; 3] = [
      closes when every stage is recorded, in order, and the segments add up to published → taken \
      within 1 µs; on one clock the wire is the difference of raw kernel stamps.",
     "Quantiles are from histograms with three digits, of messages that were taken; of the network, of \
-     messages that arrived. Intervals are 95 %, on the effective sample, as losses come in bursts and \
-     successive delays are correlated; Clopper and Pearson where a score says so. None is given where \
-     that sample is too small: docs/intervals.md. The error of the clocks' alignment is in no interval; it stands beside the metrics as a bound.",
+     messages that arrived. Intervals are 95 %. Losses come in bursts and successive delays are correlated, so that a \
+     sample is as good as fewer independent ones: these are its effective sample, on which intervals rest, and none is \
+     given where it is too small (docs/intervals.md); Clopper and Pearson where a score says so. The error of the clocks' alignment is in no interval; it stands beside the metrics as a bound.",
     "The network begins where the sending gateway hands a message to the kernel and ends where the \
      receiving gateway's receive call returned. What a host lost is not among its losses. That an \
      event stands beside an outage or follows a series is a matter of time, not of cause.",

@@ -30,8 +30,8 @@ pub(crate) fn strips(all: &Timeline, changes: &[LinkChange]) -> Option<Strips> {
                 last = channel;
                 strip.tone = Tone::Bar;
                 let what = match quantity {
-                    NetworkQuantity::Loss => "lost",
-                    NetworkQuantity::Delay => "delay",
+                    NetworkQuantity::Loss => "network loss",
+                    NetworkQuantity::Delay => "network delay",
                     NetworkQuantity::Silence => "silence",
                 };
                 what.clone_into(&mut strip.what);

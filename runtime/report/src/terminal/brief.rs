@@ -14,14 +14,12 @@ use hil_present::units::seconds;
 use hil_present::{Block, Cell, Event, EventList, Row, Section, Table, Tone, UNAVAILABLE};
 
 use super::answer::AnswerExtent;
-use super::{LINKS_SHOWN, answer, case_lead, links};
+use super::{answer, case_lead};
 use crate::answer::{Answer, Evidence, Hurt, OCCASIONS_MIN, Unresolved};
 use crate::assessment::Assessment;
 use crate::network::{ChannelNetwork, NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 use crate::score_event::ExplainedEvent;
-use crate::sections::events::{
-    NOTHING_GRAVE, cause, grave_count, gravest_first, severity_counts, severity_tone,
-};
+use crate::sections::events::{cause, grave_count, gravest_first, robot_head, severity_tone};
 use crate::sections::{deadlines, flows, outcome_words, strips};
 use crate::simulate::NO_FOLDER;
 use crate::summary::{ChannelSummary, Outcome, RunSummary};
@@ -31,7 +29,6 @@ use crate::summary::{ChannelSummary, Outcome, RunSummary};
 struct Extent {
     /// Events of the robot.
     causes: usize,
-    /// Channels, and links above them.
     channels: usize,
     flows: usize,
     deadlines: usize,
@@ -101,14 +98,7 @@ pub fn brief(summary: &RunSummary, width_columns: usize, style: Style) -> String
         title(&mut begin, summary);
         for one in [
             causes(summary, begin.width(), extent.causes),
-            // A line for each link is one less for channels.
-            channels(
-                summary,
-                extent
-                    .channels
-                    .saturating_sub(summary.run.links.len().min(LINKS_SHOWN + 1))
-                    .max(1),
-            ),
+            channels(summary, extent.channels),
             flows(summary, extent.flows),
             deadlines(summary, extent.deadlines),
             over_time(summary, extent.robot_rows),
@@ -147,7 +137,6 @@ fn title(canvas: &mut Canvas, summary: &RunSummary) {
     );
     let facts = shortened(&facts, canvas.width());
     canvas.painted_line(Tone::Strong, &facts);
-    links(canvas, summary, 1);
     if run.outcome != Outcome::Completed {
         let (tone, word) = outcome_words(run.outcome);
         let text = shortened(&format!("{word}: {}", run.exit_reason), 2 * canvas.width());
@@ -161,17 +150,8 @@ fn causes(summary: &RunSummary, width: usize, shown_count: usize) -> Section {
     let evidence = Evidence::of(summary);
     let grave = gravest_first(&all.events);
     let title = "Robot, and the network before it";
-    let mut section = Section::new("robot", title, "");
-    if summary.run.case.is_empty() {
-        return section;
-    }
-    if let Some(words) = summary.no_score_words() {
-        section.note(Tone::Caution, words);
-        return section;
-    }
-    section.aside = severity_counts(all);
-    if grave.is_empty() {
-        section.note(Tone::Plain, NOTHING_GRAVE);
+    let (mut section, has_grave) = robot_head(summary, title, grave.len() as u64);
+    if !has_grave {
         return section;
     }
     // Two lines each at most.
@@ -182,7 +162,7 @@ fn causes(summary: &RunSummary, width: usize, shown_count: usize) -> Section {
         } else {
             "not explained by the network; about then"
         };
-        let cause = format!("{relation}: {}", cause(event));
+        let cause = format!("{relation}: {}", cause(event, summary.network.as_ref()));
         Event {
             at: event.at_s.map_or_else(|| UNAVAILABLE.to_owned(), seconds),
             severity: event.severity_word(),
@@ -217,7 +197,6 @@ impl Line {
     fn of(account: &ChannelAccount, network: Option<&NetworkMetrics>) -> Self {
         let delay = account.end_to_end.distribution.measured();
         let delay = delay.map(|one| [one.p50_ns, one.p99_ns, one.max_ns]);
-        // Virtual time knows what the link model did, and no other stage.
         let on_network = network.and_then(|one| one.delay.measured());
         let on_network = on_network.map(|one| [one.p50.value_ns, one.p99.value_ns, one.max_ns]);
         Self {
@@ -348,7 +327,12 @@ fn groups<'a>(channels: &[&'a ChannelSummary], network: &[ChannelNetwork]) -> Ve
 
 /// One line a channel, alike ones together, those that lost most first.
 fn channels(summary: &RunSummary, shown_count: usize) -> Section {
-    let aside = "from publication to the consumer; gap: no message while one was due";
+    // Virtual time knows what the link model did, and no other stage.
+    let aside = if summary.run.is_virtual {
+        "delay of the link model; lost of those published; gap: none while one was due"
+    } else {
+        "publication to consumer, delay and loss; gap: none while one was due"
+    };
     let mut section = Section::new("channels", "Channels", aside);
     let has_crossed = summary.channels.iter().any(|one| one.link.is_crossing());
     let shown: Vec<&ChannelSummary> = summary

@@ -10,7 +10,6 @@ use std::path::PathBuf;
 use answer::AnswerExtent;
 pub use brief::brief;
 use hil_platform::text::shortened;
-use hil_platform::words::counted;
 use hil_present::Tone;
 use hil_present::terminal::canvas::Canvas;
 pub use hil_present::terminal::canvas::Style;
@@ -72,7 +71,9 @@ fn title(canvas: &mut Canvas, summary: &RunSummary) {
         run.topology_hash,
     );
     canvas.paragraph(0, Tone::Faint, &facts);
-    links(canvas, summary, 2);
+    if let Some(words) = sections::link_words(summary) {
+        canvas.paragraph(0, Tone::Plain, &format!("emulated link {words}"));
+    }
     canvas.rule(Tone::Faint);
 }
 
@@ -81,26 +82,5 @@ fn case_lead(run: &RunFacts) -> String {
     match run.case.as_str() {
         "" => String::new(),
         case => format!("{case} · "),
-    }
-}
-
-/// Emulated links that are named at the head; all are in `summary.json`.
-const LINKS_SHOWN: usize = 3;
-
-/// The emulated links and what they do, each in at most so many lines.
-fn links(canvas: &mut Canvas, summary: &RunSummary, line_count: usize) {
-    let all = &summary.run.links;
-    for link in all.iter().take(LINKS_SHOWN) {
-        let text = format!("emulated link {link}");
-        canvas.paragraph(
-            0,
-            Tone::Plain,
-            &shortened(&text, line_count * canvas.width()),
-        );
-    }
-    let hidden = all.len().saturating_sub(LINKS_SHOWN) as u64;
-    if hidden > 0 {
-        let text = format!("and {} in summary.json", counted(hidden, "emulated link"));
-        canvas.paragraph(0, Tone::Plain, &text);
     }
 }

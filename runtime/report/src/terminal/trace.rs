@@ -91,7 +91,7 @@ pub(crate) fn render_trace(
     field("copies", &format!("{duplicated} duplicated (RFC 5560)"));
     section.note(
         Tone::Faint,
-        "Intervals are 95 %, on the effective number of messages of known fate; memory is the autocorrelation \
+        "Intervals are 95 %, on the effective sample (docs/intervals.md) of the messages of known fate; memory is the autocorrelation \
          over messages.",
     );
     render(&[section], width_columns, style)

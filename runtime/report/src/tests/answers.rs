@@ -5,12 +5,13 @@ use hil_account::{ChannelAccount, FateCounts, MessageFate};
 use hil_core::case_study::Severity;
 
 use super::sample::{awkward, check_golden, demand, empty, flow, full, link};
+use super::sample_events::few_events;
 use crate::answer::{Answer, Clocks, HarmCount, Hurt, OccasionCount, Unresolved, Untested};
 use crate::assessment::Assessment;
-use crate::network::{TimelineRow, TimelineSubject};
+use crate::network::{PrecedingLoss, TimelineRow, TimelineSubject};
 use crate::page::Format;
 use crate::page::read::{Found, Material};
-use crate::score_event::ScoreEvents;
+use crate::score_event::{EventOutage, ScoreEvents};
 use crate::summary::{ChannelFlows, Fact, LinkKind, Outcome, RunSummary, ScoreMetric};
 use crate::terminal::{Style, brief, render};
 use hil_core::interval::{Interval, IntervalMethod, Spread};
@@ -205,6 +206,10 @@ fn a_sample_that_is_too_small_shows_no_absence_of_harm() {
     assert!(brief(&small, 100, Style::Plain).contains("too small"));
     let mut enough = run(lost_loops(Some(0), 0, 10));
     count_all(&mut enough);
+    let page = brief(&enough, 100, Style::Plain);
+    let page = page.split_whitespace().collect::<Vec<_>>().join(" ");
+    let means = "NO means fewer than 300 harms per 1,000 motion loops sent (95 %; those that come together count as one)";
+    assert!(page.contains(means), "{page}");
     let enough = answer(&enough);
     assert_eq!((enough.hurt.clone(), enough.tone()), (Hurt::No, Tone::Good));
     // The harm with the fewest occasions decides.
@@ -364,18 +369,65 @@ fn a_run_of_programs_alone_speaks_of_no_robot() {
 }
 
 #[test]
-fn every_form_names_the_emulated_links_at_its_head() {
+fn every_answer_names_the_emulated_links_or_what_the_messages_went_over() {
     let mut summary = run(lost_loops(Some(2), 0, 40));
     summary.run.links = vec![Fact::new("hop", "fixed delay of 5 ms, 1 % lost")];
     let words = "hop: fixed delay of 5 ms, 1 % lost";
-    for page in [
-        brief(&summary, 100, Style::Plain),
-        render(&summary, 100, Style::Plain),
-    ] {
-        let head: Vec<&str> = page.lines().take(6).collect();
-        let line = format!("emulated link {words}");
-        assert!(head.iter().any(|one| one.contains(&line)), "{head:?}");
+    let full = render(&summary, 100, Style::Plain);
+    let head: Vec<&str> = full.lines().take(6).collect();
+    let line = format!("emulated link {words}");
+    assert!(head.iter().any(|one| one.contains(&line)), "{head:?}");
+    for page in [brief(&summary, 100, Style::Plain), full] {
+        let (_, block) = page.rsplit_once("\u{2500}\n").unwrap();
+        let block = block.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(block.contains(&line), "{block}");
+        let sample = "sample 40 motion loops sent in 20.0 s over UDP";
+        assert!(block.contains(sample), "{block}");
     }
+    let page = page_text(&summary).replace(JOINT, " ");
+    assert!(page.contains(words), "{page}");
+}
+
+#[test]
+fn a_loss_that_is_one_of_many_is_no_cause_by_itself() {
+    let mut summary = run(lost_loops(Some(2), 0, 40));
+    let channel = summary.network.as_ref().unwrap().channels[0]
+        .channel
+        .clone();
+    let incident = summary.score_events.events.last_mut().unwrap();
+    incident.outages.clear();
+    incident.messages.truncate(1);
+    incident.messages[0].channel.clone_from(&channel);
+    let network = incident.network.as_mut().unwrap();
+    network.events.clear();
+    network.losses = vec![PrecedingLoss {
+        channel,
+        lost_count: 26,
+        sent_count: 100,
+    }];
+    let cause = |summary: &RunSummary| {
+        let page = brief(summary, 100, Style::Plain);
+        page.split_whitespace().collect::<Vec<_>>().join(" ")
+    };
+    let words = "network before it: losses all along: arm/command lost 26.00 % in the 5.00 s before, 5.52 % in \
+                 the whole run";
+    assert!(cause(&summary).contains(words), "{}", cause(&summary));
+    // As so few in a row are, and an outage is not.
+    let mut outages = summary.clone();
+    let outage = few_events().events[1].outages[0].clone();
+    let incident = outages.score_events.events.last_mut().unwrap();
+    incident.outages = vec![EventOutage {
+        channel: "arm/command".to_owned(),
+        ..outage
+    }];
+    assert!(cause(&outages).contains("network before it: outage of 800 ms"));
+    let incident = outages.score_events.events.last_mut().unwrap();
+    incident.outages[0].lost_by_network_count = 1;
+    assert!(cause(&outages).contains(words), "{}", cause(&outages));
+    // Seldom ones are causes by themselves.
+    summary.network.as_mut().unwrap().foregoing_chance_ratio = 0.1;
+    let words = "network before it: arm/command 900: lost on link hop: emulated loss";
+    assert!(cause(&summary).contains(words), "{}", cause(&summary));
 }
 
 /// Two programs of the user's with an emulated or a real link between them.

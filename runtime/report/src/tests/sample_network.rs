@@ -107,8 +107,6 @@ pub(crate) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkRepo
                 },
                 run_ns: Some((0, RUN_NS)),
                 payload_bytes: Some(96.0),
-                duplicated_count: Some(2),
-                round_trips_ns: &[4_100_000, 4_900_000],
             },
         });
     }

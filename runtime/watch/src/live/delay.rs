@@ -113,7 +113,7 @@ fn metrics(account: &ChannelAccount, clock: &ClockFigures) -> Value {
         "message_count": account.published_count,
         "fates": fates,
         "end_to_end": quantiles(&account.end_to_end.distribution),
-        "bound_ns": account.end_to_end.alignment_bound_ns,
+        "bound_ns": account.end_to_end.alignment_bound_ns(),
         "clock": {
             "relation": match clock.rung {
                 ClockRung::Exchanges => "exchanges",
@@ -160,7 +160,7 @@ fn text(head: &str, account: &ChannelAccount, clock: &ClockFigures) -> String {
     section.fact(
         "clock",
         Tone::Plain,
-        match (clock.rung, end_to_end.alignment_bound_ns) {
+        match (clock.rung, end_to_end.alignment_bound_ns()) {
             (ClockRung::OneClock, _) => "both ends read one clock".to_owned(),
             (_, Some(bound_ns)) => {
                 let bound = unsigned_duration(bound_ns);

@@ -19,8 +19,8 @@ impl EgmEvent {
                 format!("{arm} arm: {what}")
             }
             _ if self.session == 0 => format!("{arm} arm: {what}"),
-            EgmEventKind::Ended => format!("{arm} arm: session {} ended: {what}", self.session),
-            _ => format!("{arm} arm: session {}: {what}", self.session),
+            EgmEventKind::Ended => format!("{arm} arm: EGM session {} ended: {what}", self.session),
+            _ => format!("{arm} arm: EGM session {}: {what}", self.session),
         }
     }
 

@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::answer::{Hurt, Object};
-use crate::compare::Comparison;
 use crate::compare::conditions::{Condition, Verdicts};
+use crate::compare::{Comparison, Tested};
 use hil_account::network::{Metric, OrderMetrics};
 use hil_core::interval::IntervalMethod;
 
@@ -52,6 +52,8 @@ fn judged(condition: &str, figure: &ComparedMetric) -> Result<bool, String> {
         headline: Vec::new(),
         base: Vec::new(),
         new: Vec::new(),
+        base_tested: Tested::default(),
+        new_tested: Tested::default(),
         same: Vec::new(),
         differences: Vec::new(),
         cautions: Vec::new(),

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::time::Duration;
 
-use hil_account::{ChannelAccount, MessageFate};
+use hil_account::{ChannelAccount, EndToEnd, MessageFate};
 use hil_core::time::Instant;
 use hil_link::condition::LinkCondition;
 use hil_link::spec::{LinkSpec, Way};
@@ -285,7 +285,7 @@ fn channel_row(observer: &Observer, name: &str, account: Option<&ChannelAccount>
             None if observer.is_recorded(name) => Some("no message in this time".to_owned()),
             None => Some("nothing of it is recorded here".to_owned()),
         },
-        bound_ns: end_to_end.and_then(|one| one.alignment_bound_ns),
+        bound_ns: end_to_end.and_then(EndToEnd::alignment_bound_ns),
         segments: segments.unwrap_or_default(),
         history_ns: Vec::new(),
     }

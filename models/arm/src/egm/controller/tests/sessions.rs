@@ -39,7 +39,7 @@ fn a_killed_client_ends_the_session_after_the_time_out_and_the_robot_stands() {
     assert!((ended.value - 1.0).abs() <= 0.004, "{ended:?}");
     let text = ended.describe();
     assert!(
-        text.starts_with("right arm: session 1 ended: no message for 1.00"),
+        text.starts_with("right arm: EGM session 1 ended: no message for 1.00"),
         "{text}"
     );
     assert!(text.ends_with("(CommTimeout = 1 s)"), "{text}");

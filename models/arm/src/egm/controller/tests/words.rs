@@ -28,7 +28,7 @@ fn every_kind_of_event_says_what_happened() {
         0.5,
         0.0,
         0,
-        "left arm: session 3: guided motion is being set up for 0.5 s",
+        "left arm: EGM session 3: guided motion is being set up for 0.5 s",
     );
     check(
         Kind::Running,
@@ -36,7 +36,7 @@ fn every_kind_of_event_says_what_happened() {
         2.0,
         0.0,
         0,
-        "left arm: session 3: guided motion runs, 2 s after the last session ended",
+        "left arm: EGM session 3: guided motion runs, 2 s after the last session ended",
     );
     check(
         Kind::SpeedThrottled,
@@ -44,7 +44,7 @@ fn every_kind_of_event_says_what_happened() {
         34.2,
         1.0,
         0,
-        "left arm: session 3: all joints are slowed: 34.2 deg/s asked (MaxSpeedDeviation = 1 deg/s)",
+        "left arm: EGM session 3: all joints are slowed: 34.2 deg/s asked (MaxSpeedDeviation = 1 deg/s)",
     );
     check(
         Kind::SpeedFree,
@@ -52,7 +52,7 @@ fn every_kind_of_event_says_what_happened() {
         31.25,
         1.0,
         12_000_000_000,
-        "left arm: session 3: joints are slowed no more, after 12 s with up to 31.25 deg/s asked \
+        "left arm: EGM session 3: joints are slowed no more, after 12 s with up to 31.25 deg/s asked \
          (MaxSpeedDeviation = 1 deg/s)",
     );
     check(
@@ -61,7 +61,7 @@ fn every_kind_of_event_says_what_happened() {
         0.044,
         0.04,
         0,
-        "left arm: session 3: no command for 0.044 s: the last one goes on acting",
+        "left arm: EGM session 3: no command for 0.044 s: the last one goes on acting",
     );
     check(
         Kind::HoldEnded,
@@ -69,7 +69,7 @@ fn every_kind_of_event_says_what_happened() {
         1.25,
         0.0,
         0,
-        "left arm: session 3: commands are back after 1.25 s without",
+        "left arm: EGM session 3: commands are back after 1.25 s without",
     );
     check(
         Kind::QueueOverflow,
@@ -77,7 +77,7 @@ fn every_kind_of_event_says_what_happened() {
         0.0,
         1000.0,
         7,
-        "left arm: session 3: the queue is full (1000 commands): 7 dropped so far",
+        "left arm: EGM session 3: the queue is full (1000 commands): 7 dropped so far",
     );
     check(
         Kind::MotionBegan,
@@ -129,7 +129,7 @@ fn every_end_names_the_makers_parameter() {
             "stopped by request, within 0.052 s",
         ),
     ] {
-        let expected = format!("left arm: session 3 ended: {expected}");
+        let expected = format!("left arm: EGM session 3 ended: {expected}");
         check(
             EgmEventKind::Ended,
             cause as u32,
@@ -149,7 +149,7 @@ fn numbers_of_another_version_are_told_as_numbers() {
         0.0,
         0.0,
         0,
-        "left arm: session 3 ended: unknown cause 77",
+        "left arm: EGM session 3 ended: unknown cause 77",
     );
     check(
         EgmEventKind::CommandRefused,
@@ -157,7 +157,7 @@ fn numbers_of_another_version_are_told_as_numbers() {
         f64::NAN,
         0.0,
         99,
-        "left arm: session 3: command refused: joint ? of it is NaN, no finite number",
+        "left arm: EGM session 3: command refused: joint ? of it is NaN, no finite number",
     );
     let mut event = EgmEvent {
         kind: 77,
