@@ -223,19 +223,13 @@ impl Pause {
                     since(self.span.end_ns)
                 );
             }
-            PauseAfter::Session(Some(EndCause::CommTimeout)) => {
-                "its EGM session had ended by CommTimeout"
-            }
-            PauseAfter::Session(Some(EndCause::ConditionTime)) => {
-                "its EGM session had ended by CondTime"
-            }
+            PauseAfter::Session(Some(EndCause::CommTimeout)) => "EGM session ended by CommTimeout",
+            PauseAfter::Session(Some(EndCause::ConditionTime)) => "EGM session ended by CondTime",
             PauseAfter::Session(Some(EndCause::PositionDeviation)) => {
-                "its EGM session had ended by MaxPosDeviation"
+                "EGM session ended by MaxPosDeviation"
             }
-            PauseAfter::Session(Some(EndCause::Requested)) => {
-                "its EGM session had been stopped by request"
-            }
-            PauseAfter::Session(None) => "why its EGM session ended is not recorded",
+            PauseAfter::Session(Some(EndCause::Requested)) => "EGM session stopped by request",
+            PauseAfter::Session(None) => "why the EGM session ended is not recorded",
         };
         let (begin_s, end_s) = (since(self.span.begin_ns), since(self.span.end_ns));
         format!("the arm took no commands from {begin_s:.3} s to {end_s:.3} s ({why})")
@@ -553,7 +547,7 @@ mod tests {
         assert_eq!(cause(19), LossCause::Trip(timed_out));
         assert_eq!(
             cause(19).text(1_000_000_000),
-            "the arm took no commands from 19.000 s to 21.000 s (its EGM session had ended by CommTimeout)"
+            "the arm took no commands from 19.000 s to 21.000 s (EGM session ended by CommTimeout)"
         );
         assert_eq!(cause(40), LossCause::Trip(unknown));
         assert_eq!(cause(60), LossCause::Held);

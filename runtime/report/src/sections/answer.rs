@@ -83,7 +83,7 @@ impl AnswerFacts {
             all => format!(" over {}", all.join(" and ")),
         };
         rest.extend(links.map(|words| Field::new("emulated link", words)));
-        let words = format!("{}{over}{note}", answer.sample_words());
+        let words = format!("{}{note}", answer.sample_words(&over));
         rest.push(Field::new("sample", words));
         Self {
             measurement: Field::toned("measurement", tone, validity),
