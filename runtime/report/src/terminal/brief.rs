@@ -559,19 +559,42 @@ fn next(canvas: &mut Canvas, commands: &[NextCommand]) -> usize {
     folded_rows
 }
 
-/// A command without the length that it was given.
+/// A command without the lengths that it was given, with quotes or without.
 fn without_duration(command: &str) -> String {
-    const BEGIN: &str = " --set 'run.duration=";
-    let Some((before, rest)) = command.split_once(BEGIN) else {
-        return command.to_owned();
-    };
-    let rest = rest.split_once('\'').map_or("", |(_, rest)| rest);
-    before.to_owned() + rest
+    const BEGIN: &str = " --set run.duration=";
+    let mut left = command.replace(" --set 'run.duration=", &format!("{BEGIN}'"));
+    while let Some((before, rest)) = left.split_once(BEGIN) {
+        let rest = match rest.strip_prefix('\'') {
+            Some(quoted) => quoted.split_once('\'').map_or("", |(_, rest)| rest),
+            None => rest.find(' ').map_or("", |end| &rest[end..]),
+        };
+        left = before.to_owned() + rest;
+    }
+    left
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_length_that_was_given_is_taken_out_however_it_was_written() {
+        for given in [
+            "run.duration=6s",
+            "'run.duration=\"6 s\"'",
+            "'run.duration=6 s' --set run.duration=7s",
+        ] {
+            let command = format!("hil-runtime --topology a.toml --set {given} --set run.seed=3");
+            assert_eq!(
+                without_duration(&command),
+                "hil-runtime --topology a.toml --set run.seed=3"
+            );
+        }
+        assert_eq!(
+            without_duration("hil-runtime --set run.duration=6s"),
+            "hil-runtime"
+        );
+    }
 
     #[test]
     fn the_bound_of_the_worst_channel_is_the_largest() {
