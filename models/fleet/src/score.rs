@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use crate::case::{FLEET_AUTHORITY, FLEET_STATE, FLEET_TRUTH, Fleet, FleetParameters};
 use crate::events::events;
 use crate::messages::{Authority, State, Truth};
-use crate::referee::{Referee, SCAN_PERIOD, Tally};
+use crate::referee::{Clearances, Referee, SCAN_PERIOD, Tally};
 use crate::standing::{Patience, Standstill, standstills};
 use hil_core::case_study::{ErrorSeries, Harm, Metric, Score};
 use hil_core::interval::Spread;
@@ -54,6 +54,9 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
     };
     score.metrics.extend(collisions(tally, collided));
     score.metrics.extend(distances(case, tally));
+    score
+        .metrics
+        .extend(clearances(&tally.clearances, referee.spacing_m()));
     score.metrics.extend(commands(tally));
     score.metrics.extend(ages(log));
     score.metrics.extend(work(tally, run_s));
@@ -208,6 +211,41 @@ fn distances(case: &Fleet, tally: &Tally) -> Vec<Metric> {
             tally.late_overshoot_max_m,
             "of authorities that came when the robot could not stop there any more",
         ),
+    ]
+}
+
+/// How near robots came to each other.
+fn clearances(seen: &Clearances, spacing_m: f64) -> Vec<Metric> {
+    let count = seen.count();
+    let bin_m = Clearances::BIN_SPACINGS * spacing_m;
+    let quantile = |label: Label, quantile| {
+        let clearance_m = seen.quantile(quantile).map(|spacings| spacings * spacing_m);
+        let method = format!(
+            "least distance between footprints in each of {count} approaches, 0 in contact; middle of a bin of {bin_m:.3} m"
+        );
+        label.measured(
+            clearance_m,
+            method,
+            "no two robots under way came near each other and parted again",
+        )
+    };
+    vec![
+        label("approaches_count", "approaches", "1").count(
+            count,
+            format!(
+                "two robots of a fleet, both under way, within two pose spacings ({:.2} m) of each other until they \
+                 part, looked at every 30 ms; those not over at the end do not count",
+                2.0 * spacing_m
+            ),
+        ),
+        label("near_misses_count", "near misses", "1").count(
+            seen.near_miss_count(),
+            format!(
+                "approaches to less than a pose spacing ({spacing_m:.2} m) without contact"
+            ),
+        ),
+        quantile(label("clearance_m_p50", "clearance of approaches, median", "m"), 0.5),
+        quantile(label("clearance_m_p5", "clearance of approaches, 5 %", "m"), 0.05),
     ]
 }
 
@@ -557,6 +595,20 @@ mod tests {
             ..tally(2)
         };
         assert_eq!(collided_share(&few, &[0, 0]), None);
+    }
+
+    #[test]
+    fn without_an_approach_there_is_no_clearance() {
+        let metrics = clearances(&Clearances::default(), 0.3);
+        let known = metrics.iter().map(|metric| (metric.name, metric.value));
+        let expected = [
+            ("approaches_count", Some(0.0)),
+            ("near_misses_count", Some(0.0)),
+            ("clearance_m_p50", None),
+            ("clearance_m_p5", None),
+        ];
+        assert!(known.eq(expected), "{metrics:?}");
+        assert!(metrics[2].method.contains("no two robots"), "{metrics:?}");
     }
 
     #[test]

@@ -617,7 +617,7 @@ fn mechanism_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
     }
 }
 
-const COMMANDS: [Field<FleetTally>; 12] = [
+const COMMANDS: [Field<FleetTally>; 13] = [
     Field::count("commands", "Commands", |t| t.commands.offered_count),
     Field::count("commands_lost", "Lost", |t| t.commands.lost_count),
     Field::count("states", "States", |t| t.status.offered_count),
@@ -640,6 +640,16 @@ const COMMANDS: [Field<FleetTally>; 12] = [
     Field::number("separation_min_m", "Closest m", 2, |t| {
         t.referee.separation_min_m
     }),
+    Field::number(
+        "near_misses_per_1000",
+        "Near misses x 1000",
+        1,
+        |t: &FleetTally| {
+            let near_misses = t.referee.clearances.near_miss_count();
+            (t.section_count() > 0).then(|| 1e3 * near_misses as f64 / t.section_count() as f64)
+        },
+    )
+    .ranked(1),
 ];
 
 /// What became of the commands in each cell of the table of mechanisms.
@@ -651,6 +661,9 @@ fn command_table(results: &[CellResult<'_>]) -> Table {
         notes: vec![
             "late: too late to stop at; ignored: behind the robot, which drove on; refused: not \
              applied because it could not stop (safe); stale: older than one applied"
+                .to_owned(),
+            "near misses: two robots under way within a pose spacing of each other without contact, \
+             per CS; counted once until they are two spacings apart"
                 .to_owned(),
         ],
         ..by_cell(

@@ -9,6 +9,7 @@
 //! would count one collision many times: at the last poses passed, where the original's checker
 //! looks, robots that follow each other closely overlap and part with each pose.
 
+mod approaches;
 pub mod live;
 mod pairs;
 mod sections;
@@ -23,6 +24,8 @@ use serde::Serialize;
 use crate::geometry::{OrientedBox, Pose, floor_index};
 use crate::messages::{Truth, TruthKind};
 use crate::path::{Path, PathId};
+use crate::referee::approaches::Approaches;
+pub use crate::referee::approaches::Clearances;
 use crate::referee::pairs::PairFinder;
 use crate::referee::sections::ActiveSections;
 use crate::robot::NO_PATH;
@@ -44,9 +47,8 @@ pub struct Referee {
     tracks: Vec<Track>,
     finder: PairFinder,
     sections: ActiveSections,
-    /// Robots this far apart have separated.
-    separated_m: f64,
     overlapping: Vec<[u32; 2]>,
+    approaches: Approaches,
     tally: Tally,
     incidents: Vec<Incident>,
     collided_after: Vec<u64>,
@@ -63,16 +65,15 @@ impl Referee {
             .filter_map(|id| world.paths.get(id))
             .map(|path| path.spacing_m())
             .fold(0.0, f64::max);
-        // The original's checker looks where each robot was up to a pose spacing before.
-        let separated_m = 2.0 * spacing_m;
-        let reach_m = 2.0 * world.vehicle.footprint.radius_m() + separated_m;
+        let approaches = Approaches::new(spacing_m, 4 * count);
+        let reach_m = 2.0 * world.vehicle.footprint.radius_m() + approaches.separated_m();
         Self {
             per_fleet,
             tracks: fleet.into_iter().cycle().take(count).collect(),
             finder: PairFinder::new(reach_m, per_fleet),
             sections: ActiveSections::new(count),
-            separated_m,
             overlapping: Vec::with_capacity(4 * count),
+            approaches,
             tally: Tally::default(),
             incidents: Vec::with_capacity(INCIDENTS_MAX.min(64)),
             collided_after: Vec::new(),
@@ -134,10 +135,13 @@ impl Referee {
         }
         // Robots that have moved apart beyond reach are no pair to judge any more.
         let (tracks, finder) = (&self.tracks, &self.finder);
-        self.overlapping.retain(|pair| {
+        let is_within_reach = |pair: &[u32; 2]| {
             let [one, other] = pair.map(|robot| &tracks[robot as usize]);
             finder.are_within_reach(one, other)
-        });
+        };
+        self.overlapping.retain(is_within_reach);
+        self.approaches
+            .end_apart(is_within_reach, &mut self.tally.clearances);
     }
 
     /// Feeds records, sorted by time, and scans every [`SCAN_PERIOD`] from `start` to `end`: for
@@ -166,6 +170,11 @@ impl Referee {
     pub(crate) fn standing_count(&self) -> usize {
         let on_mission = self.tracks.iter().filter(|track| track.is_driving);
         on_mission.filter(|track| !track.has_moved).count()
+    }
+
+    /// Largest distance of two poses of a path, metres: the unit of [`Clearances`].
+    pub(crate) fn spacing_m(&self) -> f64 {
+        self.approaches.spacing_m
     }
 
     /// What it has counted.
@@ -243,8 +252,12 @@ impl Referee {
             let distance_m = covered[0].distance_m(&covered[1]);
             self.tally.separation_min_m = Some(least_m.min(distance_m));
         }
-        let is_separated = gap_m > self.separated_m;
-        if one.is_driving && other.is_driving {
+        let is_separated = gap_m > self.approaches.separated_m();
+        let is_under_way = one.is_driving && other.is_driving;
+        let ground = is_under_way.then_some(&covered);
+        self.approaches
+            .judge(pair, gap_m, ground, &mut self.tally.clearances);
+        if is_under_way {
             let begun_count = self.sections.judge(pair, is_separated, || {
                 let at_index = [one, other].map(|track| track.covered_at_index(vehicle));
                 at_index[0].overlaps(&at_index[1])
@@ -460,6 +473,9 @@ hil_core::counts! {
         outside_count: u64;
         /// Smallest distance between two robots of a fleet, metres; `None` when none came near.
         separation_min_m: Option<f64> => least;
+        /// Least distance in each approach: two robots of a fleet, both under way, nearer than two pose spacings until
+        /// they have separated. An approach that is not over does not count.
+        clearances: Clearances;
         /// Farthest a robot went past an authority that came in time, metres.
         stop_error_max_m: f64 => f64::max;
         /// Farthest a robot went past an authority that came too late, metres.

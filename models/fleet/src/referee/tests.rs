@@ -213,3 +213,121 @@ fn the_grid_finds_the_pairs_a_search_of_all_pairs_finds() {
         }
     }
 }
+
+/// A robot on its mission 1, standing at `travelled_m` of a path.
+fn under_way(robot_id: u32, path_id: u32, travelled_m: f64) -> Truth {
+    Truth {
+        mission_id: 1,
+        ..standing(robot_id, path_id, travelled_m, TruthKind::Motion)
+    }
+}
+
+/// Clearances of two robots under way on the paths 0 and 2, looked at where each of `places` puts them.
+fn clearances(scenario: Scenario, places: &[[f64; 2]]) -> Clearances {
+    let scene = scene(scenario);
+    let mut referee = Referee::new(&scene, 1);
+    for robot in 0..2 {
+        referee.on_truth(&standing(robot, 2 * robot, 0.0, TruthKind::MissionStarted));
+    }
+    for (step, place) in (0..).zip(places) {
+        for (robot, travelled_m) in (0..).zip(place) {
+            referee.on_truth(&under_way(robot, 2 * robot, *travelled_m));
+        }
+        referee.scan(at(0.03 * f64::from(step)));
+    }
+    referee.tally().clearances
+}
+
+fn counts(seen: &Clearances) -> (u64, u64) {
+    (seen.count(), seen.near_miss_count())
+}
+
+/// Robot 0 starts with 4 m free behind it; the gap is 4 m, and what it drives, less what robot 1 drives.
+fn follow(gaps_m: &[f64]) -> Clearances {
+    let mut place = [0.0, 0.0];
+    let places: Vec<_> = gaps_m
+        .iter()
+        .map(|gap_m| {
+            // Neither goes back.
+            place[0] = f64::max(place[0], place[1] - 4.0 + gap_m);
+            place[1] = 4.0 + place[0] - gap_m;
+            place
+        })
+        .collect();
+    clearances(Scenario::Following, &places)
+}
+
+#[test]
+fn a_pass_is_one_approach_with_its_least_distance() {
+    // Poses are about 0.3 m apart: 0.2 m is in the seventh bin of a tenth of that. Out of reach it is over.
+    let seen = follow(&[3.0, 0.5, 0.2, 0.4, 2.0]);
+    assert_eq!(counts(&seen), (1, 1));
+    assert_eq!(seen.quantile(0.5), Some(0.65));
+    // It is over as well within reach, two spacings apart; a second is counted anew.
+    let seen = follow(&[3.0, 0.5, 0.2, 0.7, 0.4, 0.7]);
+    assert_eq!(counts(&seen), (2, 1));
+    assert_eq!(seen.quantile(0.5), Some(0.65));
+    assert_eq!(seen.quantile(1.0), Some(1.35));
+    // Farther away than two spacings there is none.
+    let seen = follow(&[3.0, 0.7, 0.61, 2.0]);
+    assert_eq!((counts(&seen), seen.quantile(0.5)), ((0, 0), None));
+}
+
+#[test]
+fn a_collision_is_an_approach_and_no_near_miss() {
+    let seen = follow(&[3.0, 0.5, -0.1, 0.2, 2.0]);
+    assert_eq!(counts(&seen), (1, 0));
+    assert_eq!(seen.quantile(0.5), Some(0.0));
+}
+
+#[test]
+fn robots_that_are_still_near_at_the_end_do_not_count() {
+    assert_eq!(counts(&follow(&[3.0, 0.5, 0.2, 0.5])), (0, 0));
+}
+
+#[test]
+fn robots_that_part_by_less_than_they_must_are_in_one_approach() {
+    let seen = follow(&[3.0, 0.4, 0.55, 0.1, 0.55, 0.25, 2.0]);
+    assert_eq!(counts(&seen), (1, 1));
+    assert_eq!(seen.quantile(0.5), Some(0.35));
+}
+
+#[test]
+fn a_clearance_is_the_distance_of_corners_and_not_the_gap_between_sides() {
+    // Both 0.24 m from where they would touch the lane of the other, 0.339 m from corner to corner; 2 m by 0.5 m each.
+    let before = 20.0 - 1.25 - 0.24;
+    let seen = clearances(Scenario::Crossing, &[[0.0; 2], [before; 2], [30.0, before]]);
+    assert_eq!(counts(&seen), (1, 0));
+    assert_eq!(seen.quantile(0.5), Some(1.15));
+    // Sides 0.5 m apart, which is within two spacings, and corners 0.707 m, which is not.
+    let before = 20.0 - 1.25 - 0.5;
+    let seen = clearances(Scenario::Crossing, &[[0.0; 2], [before; 2], [30.0, before]]);
+    assert_eq!(counts(&seen), (0, 0));
+}
+
+#[test]
+fn robots_that_are_not_both_under_way_approach_no_one() {
+    let scene = scene(Scenario::Following);
+    let mut referee = Referee::new(&scene, 1);
+    referee.on_truth(&standing(1, 2, 0.0, TruthKind::MissionStarted));
+    for (step, travelled_m) in (0..).zip([0.0, 3.8, 10.0]) {
+        referee.on_truth(&under_way(1, 2, travelled_m));
+        referee.scan(at(0.03 * f64::from(step)));
+    }
+    assert!((referee.tally().separation_min_m.unwrap() - 0.2).abs() < 1e-9);
+    assert_eq!(counts(&referee.tally().clearances), (0, 0));
+}
+
+#[test]
+fn clearances_of_runs_add_up() {
+    let mut all = Tally::default();
+    for gaps_m in [[3.0, 0.2, 2.0], [3.0, -0.1, 2.0], [3.0, 0.4, 2.0]] {
+        all.merge(&Tally {
+            clearances: follow(&gaps_m),
+            ..Tally::default()
+        });
+    }
+    assert_eq!(counts(&all.clearances), (3, 1));
+    let quantiles = [0.05, 0.34, 0.5, 0.99].map(|one| all.clearances.quantile(one));
+    assert_eq!(quantiles, [Some(0.0), Some(0.65), Some(0.65), Some(1.35)]);
+}
