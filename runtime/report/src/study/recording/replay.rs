@@ -77,11 +77,16 @@ fn score(
         topology["run"]["seed"] = json!(seed);
         let links = topology["links"].as_object_mut();
         for link in links.into_iter().flat_map(|links| links.values_mut()) {
-            *link = json!({
+            let mut replayed = json!({
                 "via": "emulated",
                 "between": link["between"].take(),
                 "trace": traces.display().to_string(),
             });
+            // Two links may not have the same.
+            if let Some(port) = link.get("port") {
+                replayed["port"] = port.clone();
+            }
+            *link = replayed;
         }
     };
     let topology = manifest.read_changed_topology(over_traces, registry.known());
