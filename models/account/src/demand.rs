@@ -271,6 +271,16 @@ impl DemandFold {
             }
             (_, transfer) => transfer,
         };
+        // Whatever comes of it, it was not in time where the run outlasted its time.
+        let is_over =
+            |at_ns: i64| self.run.is_some() && at_ns.saturating_add(self.latency_max_ns) <= end_ns;
+        let transfer = match transfer {
+            Transfer::InFlight if published_ns.is_some_and(is_over) => Transfer::Received {
+                delay_ns: i64::MAX,
+                bound_ns: 0,
+            },
+            transfer => transfer,
+        };
         let delay_ns = self.note(count, transfer);
         match published_ns {
             Some(at_ns) => self.advance(at_ns),

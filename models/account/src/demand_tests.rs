@@ -109,13 +109,19 @@ fn a_message_beyond_the_latency_is_not_in_time_and_ends_no_failure() {
 fn a_failure_that_is_open_at_the_end_lasts_to_the_end_of_the_run() {
     let lost: Vec<_> = (5..10).map(|index| (index, Transfer::Lost)).collect();
     assert_eq!(down(&ten(&lost)), (1, 36, Some((124, 36, true))));
-    // What is under way at the end neither ends it nor counts.
+    // What is under way at the end does not end it, and is late where its time was over.
     let mut under_way = lost;
     under_way[3].1 = Transfer::InFlight;
     under_way[4].1 = received(17);
     let found = ten(&under_way);
     assert_eq!(down(&found), (1, 36, Some((124, 36, true))));
-    assert_eq!((found.lost_count, found.unknown_count), (3, 2));
+    let counts = (found.lost_count, found.late_count, found.unknown_count);
+    assert_eq!(counts, (3, 1, 1));
+    // A link that holds everything back to the end.
+    let held: Vec<_> = (5..10).map(|index| (index, Transfer::InFlight)).collect();
+    let found = ten(&held);
+    assert_eq!(down(&found), (1, 36, Some((124, 36, true))));
+    assert_eq!((found.late_count, found.unknown_count), (4, 1));
     // Messages whose time was not over by then make no failure.
     let found = ten(&[(8, Transfer::Lost), (9, Transfer::Lost)]);
     assert_eq!(down(&found), (0, 0, None));

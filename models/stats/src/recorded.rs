@@ -175,6 +175,10 @@ impl PooledShare {
     }
 }
 
+fn is_replayed<P>(run: &RecordedRun<P>) -> bool {
+    run.replays.as_ref().is_ok_and(|scores| !scores.is_empty())
+}
+
 /// Runs that make one row: those of one published network, one link and like parameters, or a run alone.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordedRow<P> {
@@ -244,7 +248,7 @@ impl<P> RecordedRow<P> {
         self.runs.first().expect("a row is made of a run")
     }
 
-    /// The same robots in virtual time over the traces of its runs; `None` where no run was replayed.
+    /// The same robots in virtual time over the traces of its runs; `None` where not each was replayed.
     pub fn replayed(&self) -> Option<Self>
     where
         P: Clone,
@@ -266,9 +270,8 @@ impl<P> RecordedRow<P> {
             };
             scores.map(replay).collect()
         };
-        let runs: Vec<_> = self.runs.iter().flat_map(of_run).collect();
-        (!runs.is_empty()).then(|| Self {
-            runs,
+        self.runs.iter().all(is_replayed).then(|| Self {
+            runs: self.runs.iter().flat_map(of_run).collect(),
             left_out: Vec::new(),
             is_named_by_folder: self.is_named_by_folder,
             is_replay: true,
@@ -382,8 +385,12 @@ impl<P> RecordedRow<P> {
             if let Err(why) = &crossing.delays {
                 parts.push(format!("{of}delays are unavailable: {why}"));
             }
-            if let Err(why) = &run.replays {
-                parts.push(format!("{of}not replayed: {why}"));
+            match &run.replays {
+                Err(why) => parts.push(format!("{of}not replayed: {why}")),
+                Ok(scores) if scores.is_empty() && self.runs.iter().any(is_replayed) => {
+                    parts.push(format!("not replayed, beside others: {}", run.folder));
+                }
+                Ok(_) => {}
             }
         }
         let left_out = self.left_out.iter().map(|run| {
@@ -403,7 +410,7 @@ pub const ROWS_NOTE: &str = "HiL with a kind of link: recorded runs in real time
 
 /// What a table with replays says of them all.
 pub const REPLAYS_NOTE: &str = "Replay: the same robots in virtual time over the traces of the runs in the row above, with \
-                                seeds of their own; the verdict is against that row";
+                                seeds of their own; the verdict is against that row, and agrees where no difference is shown";
 
 /// What the verdicts of a case's replays come to; `None` of none.
 pub fn replays_summary(verdicts: &[Verdict]) -> Option<String> {
@@ -417,7 +424,7 @@ pub fn replays_summary(verdicts: &[Verdict]) -> Option<String> {
         .collect();
     (!verdicts.is_empty()).then(|| {
         format!(
-            "Against their own traces in virtual time, of {} rows: {}; any of them differs by chance in one of twenty tables.",
+            "Against their own traces in virtual time, of {} rows: {}; by chance one of them differs in at most one of twenty tables.",
             verdicts.len(),
             counts.join(", ")
         )
@@ -720,10 +727,27 @@ mod tests {
         let mut first = run("a", short, 1);
         first.replays = Ok(vec![score(), score()]);
         let mut other = run("b", short, 2);
-        other.replays = Err("it left no traces".to_owned());
+        other.replays = Ok(vec![score()]);
+        let failed = RecordedRun {
+            replays: Err("it left no traces".to_owned()),
+            ..other.clone()
+        };
+        let without = RecordedRun {
+            replays: Ok(Vec::new()),
+            ..other.clone()
+        };
+        let none = PooledShare::of(&[], Some(1.0));
+        for (run, why) in [
+            (failed, "b: not replayed: it left no traces"),
+            (without, "not replayed, beside others: b"),
+        ] {
+            let row = RecordedRow::of_runs(vec![first.clone(), run], |_, _| true).remove(0);
+            assert_eq!(row.replayed(), None);
+            assert!(row.note(&none).contains(why), "{}", row.note(&none));
+        }
         let row = RecordedRow::of_runs(vec![first, other], |_, _| true).remove(0);
         let replay = row.replayed().unwrap();
-        assert!(replay.is_replay() && replay.runs().len() == 2);
+        assert!(replay.is_replay() && replay.runs().len() == 3);
         assert_eq!(replay.runs()[1].count("collisions").unwrap(), 3);
         assert_eq!(
             replay.method(),
@@ -731,11 +755,6 @@ mod tests {
         );
         // Loss and delay are those of the row.
         assert_eq!((replay.loss_ratio(), replay.delay_ms(0.5)), (None, None));
-        let none = PooledShare::of(&[], Some(1.0));
-        assert!(
-            row.note(&none)
-                .contains("b: not replayed: it left no traces")
-        );
         let alone = RecordedRow::of_runs(vec![run("c", short, 3)], |_, _| true);
         assert_eq!(alone[0].replayed(), None);
     }

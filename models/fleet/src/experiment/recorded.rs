@@ -68,7 +68,7 @@ impl FleetRow {
                 count: run.count(COLLISIONS.name)?,
                 of: run.count(CRITICAL_SECTIONS.name)?,
             };
-            if share.of == 0 {
+            if share.of == 0 && !row.is_replay() {
                 return Err(run.refused("no robot passed a critical section"));
             }
             tally.section_collisions_count += share.count;

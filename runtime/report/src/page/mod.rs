@@ -279,12 +279,16 @@ pub fn figure_files(
             None => "this report has no figure: nothing was measured".to_owned(),
         });
     }
+    let print = match format {
+        Format::Pdf => Some(pdf::options()?),
+        _ => None,
+    };
     let file = |one: &&&Drawing| {
         Ok(FigureFile {
             name: one.name.clone(),
-            bytes: match format {
-                Format::Pdf => pdf::of_figure(&one.svg)?,
-                _ => svg::standalone(&one.svg).into_bytes(),
+            bytes: match &print {
+                Some(options) => pdf::of_figure(&one.svg, options)?,
+                None => svg::standalone(&one.svg).into_bytes(),
             },
         })
     };

@@ -11,11 +11,11 @@ use super::svg::for_print;
 /// Families that have what our figures say, the first that this host has.
 const FAMILIES: [&str; 4] = ["DejaVu Sans", "Liberation Sans", "Noto Sans", "FreeSans"];
 
-/// The figure as a page of its size.
+/// How figures are read.
 ///
 /// # Errors
 /// When this host has no font.
-pub(super) fn of_figure(svg: &str) -> Result<Vec<u8>, String> {
+pub(super) fn options() -> Result<usvg::Options<'static>, String> {
     let mut fonts = fontdb::Database::new();
     fonts.load_system_fonts();
     let has = |family: &&&str| {
@@ -33,13 +33,19 @@ pub(super) fn of_figure(svg: &str) -> Result<Vec<u8>, String> {
         )
     })?;
     fonts.set_sans_serif_family(*family);
-    let options = usvg::Options {
+    Ok(usvg::Options {
         font_family: (*family).to_owned(),
         fontdb: Arc::new(fonts),
         ..usvg::Options::default()
-    };
-    let tree =
-        usvg::Tree::from_str(&for_print(svg), &options).map_err(|error| error.to_string())?;
+    })
+}
+
+/// The figure as a page of its size.
+///
+/// # Errors
+/// When it is no SVG.
+pub(super) fn of_figure(svg: &str, options: &usvg::Options<'_>) -> Result<Vec<u8>, String> {
+    let tree = usvg::Tree::from_str(&for_print(svg), options).map_err(|error| error.to_string())?;
     let pdf = svg2pdf::to_pdf(&tree, ConversionOptions::default(), PageOptions::default());
     let mut pdf = pdf.map_err(|error| error.to_string())?;
     // What follows the end of a PDF is a comment.
@@ -58,10 +64,11 @@ mod tests {
         let mut svg = Svg::new(200.0, 100.0);
         svg.text("strong", 8.0, 15.0, Anchor::Start, "Delay, µs");
         svg.line("line c1", 0.0, 0.0, 200.0, 100.0);
-        let pdf = match of_figure(&svg.finish("t", &[])) {
-            Ok(pdf) => pdf,
+        let options = match options() {
+            Ok(options) => options,
             Err(why) => return assert!(why.starts_with("no font for a PDF on this host"), "{why}"),
         };
+        let pdf = of_figure(&svg.finish("t", &[]), &options).unwrap();
         assert!(pdf.starts_with(b"%PDF-1."));
         // With a font in it, so that it looks alike everywhere.
         let has = |bytes: &[u8]| pdf.windows(bytes.len()).any(|part| part == bytes);

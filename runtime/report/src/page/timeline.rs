@@ -274,7 +274,8 @@ fn timed_of_case(series: &[Series]) -> Vec<&Series> {
 pub(super) fn each_of_case(key: &str, series: &[Series], steps: usize) -> Vec<Drawing> {
     let each = timed_of_case(series).into_iter();
     let drawn = each.filter_map(|one| {
-        let (drawn, _) = drawn(&format!("{key}-{}", one.name), &one.title, &[one], steps);
+        let name = format!("{key}-{}", one.name);
+        let (drawn, _) = drawn(&name, &one.title, &[one], steps, usize::MAX);
         Some(drawn?.0)
     });
     drawn.collect()
@@ -288,15 +289,22 @@ pub(super) fn of_case(
 ) -> (Option<(Drawing, Plot)>, Vec<String>) {
     let title = "The robot, as its case plots it";
     let timed = timed_of_case(series);
-    drawn(&format!("{key}-robot"), title, &timed, steps)
+    drawn(
+        &format!("{key}-robot"),
+        title,
+        &timed,
+        steps,
+        CASE_PANELS_MAX,
+    )
 }
 
-/// The picture of `timed`, and the files that found no room.
+/// The picture of `timed` in so many panels at most, and the files that found no room.
 fn drawn(
     name: &str,
     title: &str,
     timed: &[&Series],
     steps: usize,
+    panels_max: usize,
 ) -> (Option<(Drawing, Plot)>, Vec<String>) {
     let moments = timed
         .iter()
@@ -307,7 +315,7 @@ fn drawn(
     if until_s <= from_s {
         return (None, Vec::new());
     }
-    let (panels, left_out) = case_panels(timed, &(from_s..until_s), steps);
+    let (panels, left_out) = case_panels(timed, &(from_s..until_s), steps, panels_max);
     let axis_words = timed
         .iter()
         .map(|one| one.columns[0].label.as_str())
@@ -339,13 +347,14 @@ fn case_panels(
     timed: &[&Series],
     span: &Range<f64>,
     steps: usize,
+    panels_max: usize,
 ) -> (Vec<PlotPanel>, Vec<String>) {
     let mut panels = Vec::new();
     let mut left_out = Vec::new();
     for one in timed {
         let columns: Vec<usize> = (1..one.columns.len()).collect();
         for chunk in columns.chunks(one.panel_lines.unwrap_or(LINES_MAX)) {
-            if panels.len() == CASE_PANELS_MAX {
+            if panels.len() == panels_max {
                 left_out.push(format!("series/{}.csv", one.name));
                 break;
             }

@@ -25,7 +25,6 @@ use serde_json::Value;
 
 use self::folder::{Part, RowFolder};
 use self::next::{Found, Next, REFUSED_MAX, Target, next};
-use self::replay::Continue;
 use super::RunArgument;
 use super::recorded::recorded;
 use crate::compare::{ComparedRun, add_leaves};
@@ -635,17 +634,10 @@ impl RunMaker<'_> {
                 Ok(Made::Sound { folder, count })
             });
         if let (Ok(Made::Sound { folder, .. }), Part::Run(_)) = (&outcome, part) {
-            let (signals, console) = (self.signals, &mut *self.console);
-            let end = replay::write(folder, self.registry, &mut || {
-                meanwhile(1.0, console);
-                match signals.received() {
-                    None => Continue::Yes,
-                    Some(_) => Continue::No,
-                }
-            });
-            if end.map_err(failed)? == Continue::No {
-                return Ok(Made::Interrupted);
-            }
+            // After a signal as well: the run is whole, and its traces are not kept.
+            let console = &mut *self.console;
+            replay::write(folder, self.registry, &mut || meanwhile(1.0, console))
+                .map_err(failed)?;
         }
         Ok(match outcome {
             Ok(made) => made,

@@ -21,31 +21,17 @@ const COUNT: u64 = 4;
 /// Runs of a recording have seeds below it.
 const SEED_STEP: u64 = 1 << 32;
 
-/// Whether more is to be done.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Continue {
-    Yes,
-    No,
-}
-
-/// Writes the scores beside what the run in `folder` left, or why there are none; calls `watch` now and then, and stops between
-/// two of them where that says so.
+/// Writes the scores beside what the run in `folder` left, or why there are none; calls `watch` now and then.
 ///
 /// # Errors
 /// When a file cannot be written.
-pub(super) fn write(
-    folder: &Path,
-    registry: &Registry,
-    watch: &mut dyn FnMut() -> Continue,
-) -> io::Result<Continue> {
+pub(super) fn write(folder: &Path, registry: &Registry, watch: &mut dyn FnMut()) -> io::Result<()> {
     let manifest = Manifest::read(&RunFolder::existing(folder))?;
     let place = folder.join(FOLDER);
     fs::create_dir_all(&place)?;
     for index in 1..=COUNT {
         let seed = manifest.seed + index * SEED_STEP;
-        match score(&manifest, folder, seed, registry, &mut || {
-            watch();
-        }) {
+        match score(&manifest, folder, seed, registry, watch) {
             Ok(score) => {
                 let text = serde_json::to_vec(&score).map_err(io::Error::other)?;
                 put(&place.join(format!("{seed}.json")), &text)?;
@@ -55,12 +41,8 @@ pub(super) fn write(
                 break;
             }
         }
-        if watch() == Continue::No {
-            return Ok(Continue::No);
-        }
     }
-    File::open(&place)?.sync_all()?;
-    Ok(Continue::Yes)
+    File::open(&place)?.sync_all()
 }
 
 /// The score of robots with `seed` over the traces in `folder`.
@@ -102,7 +84,7 @@ fn put(path: &Path, bytes: &[u8]) -> io::Result<()> {
     file.sync_all()
 }
 
-/// The scores that [`Replayed::write`] left in `folder`, in the order of their seeds, or why there are none; nothing where it
+/// The scores that [`write`] left in `folder`, in the order of their seeds, or why there are none; nothing where it
 /// was not asked for.
 ///
 /// # Errors
@@ -143,13 +125,12 @@ mod tests {
         let manifest =
             json!({ "schema_version": 1, "program": { "name": "hil-runtime", "version": "0" } });
         fs::write(folder.join("manifest.json"), manifest.to_string()).unwrap();
-        let end = write(&folder, &registry, &mut || Continue::Yes).unwrap();
-        assert_eq!(end, Continue::Yes);
+        write(&folder, &registry, &mut || {}).unwrap();
         let why = read(&folder).unwrap().unwrap_err();
         assert!(why.starts_with("it left no traces: "), "{why}");
         // Neither can what is there be used.
         fs::create_dir(folder.join("traces")).unwrap();
-        write(&folder, &registry, &mut || Continue::Yes).unwrap();
+        write(&folder, &registry, &mut || {}).unwrap();
         let why = read(&folder).unwrap().unwrap_err();
         assert!(why.starts_with("its topology cannot be read: "), "{why}");
         fs::remove_dir_all(folder).unwrap();
