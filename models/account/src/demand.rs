@@ -181,6 +181,7 @@ impl Transfer {
 
 /// Why a channel has no figures of a service.
 const STAYS: &str = "the channel stays on its host: no communication service carries it";
+const OTHER_INTERVAL: &str = "most messages were published more than two intervals after the one before: interval is another";
 const UNALIGNED: &str =
     "the clocks of the two hosts are not aligned: no latency can be held against latency_max";
 
@@ -199,6 +200,9 @@ pub struct DemandFold {
     /// The service's clock: time asked for up to the newest publication.
     asked_ns: i64,
     idle_ns: i64,
+    /// From one publication to the next, and of these the pauses.
+    step_count: u64,
+    pause_count: u64,
     in_time_count: u64,
     late_count: u64,
     lost_count: u64,
@@ -230,6 +234,8 @@ impl DemandFold {
             has_unplaced: false,
             asked_ns: 0,
             idle_ns: 0,
+            step_count: 0,
+            pause_count: 0,
             in_time_count: 0,
             late_count: 0,
             lost_count: 0,
@@ -357,6 +363,10 @@ impl DemandFold {
         let since_ns = self.last_ns.or_else(|| Some(self.run?.start.as_ns()));
         let length_ns = since_ns.map_or(0, |since_ns| at_ns.saturating_sub(since_ns).max(0));
         let is_pause = length_ns > self.interval_ns.saturating_mul(2) && !self.has_unplaced;
+        if self.last_ns.is_some() {
+            self.step_count = self.step_count.saturating_add(1);
+            self.pause_count = self.pause_count.saturating_add(u64::from(is_pause));
+        }
         let asked_ns = match self.last_ns {
             None => 0,
             Some(_) if is_pause => self.interval_ns,
@@ -377,7 +387,9 @@ impl DemandFold {
             self.advance(run.end.as_ns());
         }
         let known_count = self.known_count();
-        let reason = if known_count == 0 && self.unknown_count == 0 {
+        let reason = if self.pause_count > self.step_count / 2 {
+            Some(OTHER_INTERVAL)
+        } else if known_count == 0 && self.unknown_count == 0 {
             Some("no message was published")
         } else if known_count == 0 {
             Some("of no message is it known whether it came in time")

@@ -151,6 +151,17 @@ fn a_pause_of_the_producer_is_no_time_of_the_service() {
 }
 
 #[test]
+fn a_channel_that_is_slower_than_its_interval_is_not_judged() {
+    let messages: Vec<_> = (0..20).map(|one| (one * 40, IN_TIME)).collect();
+    let found = judged(800, &messages);
+    assert_eq!(found.verdict, DemandVerdict::NotJudged);
+    let Metric::Unavailable { reason } = &found.service else {
+        panic!("{found:?}");
+    };
+    assert!(reason.ends_with("interval is another"), "{reason}");
+}
+
+#[test]
 fn unknown_fates_are_no_losses_but_may_decide() {
     let unknown = Transfer::Unknown;
     let found = ten(&[(2, Transfer::Lost), (3, unknown), (4, unknown)]);
