@@ -30,7 +30,7 @@ options! {
     pub struct Demand {
         /// Maximum end-to-end latency, from publication to the moment when the message stands before the consumer.
         latency_max: Duration, in Duration::from_micros(1)..=Duration::from_secs(10);
-        /// Survival time: how long the consumer can go on without a message that was due.
+        /// Survival time: how long the consumer works without a message that was due.
         survival_time: Duration, in Duration::ZERO..=Duration::from_mins(1);
         /// Transfer interval: the time from one message to the next. In a pause of more than two of them the service is not asked
         /// for.
@@ -45,7 +45,7 @@ hil_core::labelled! {
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
     #[serde(rename_all = "snake_case")]
     pub enum DemandVerdict, label {
-        /// It was, whatever became of messages of unknown fate.
+        /// It was, also with every message of unknown fate lost.
         Met = "met",
         /// It was not.
         Missed = "missed",
@@ -58,7 +58,7 @@ hil_core::labelled! {
     }
 }
 
-/// A demand, and what became of it.
+/// A demand, and the figures that it is judged by.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DemandMetrics {
     /// Maximum end-to-end latency.
@@ -128,7 +128,7 @@ pub struct DownTime {
     pub is_open: bool,
 }
 
-/// What became of a message between the interfaces of the service.
+/// The fate of a message between the interfaces of the service.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Transfer {
     /// It stood before the consumer.
@@ -358,7 +358,7 @@ impl DemandFold {
             .saturating_add(self.lost_count)
     }
 
-    /// The service's clock goes on to what happens at `at_ns`.
+    /// Advances the service's clock to `at_ns`.
     fn advance(&mut self, at_ns: i64) {
         let since_ns = self.last_ns.or_else(|| Some(self.run?.start.as_ns()));
         let length_ns = since_ns.map_or(0, |since_ns| at_ns.saturating_sub(since_ns).max(0));
@@ -378,7 +378,7 @@ impl DemandFold {
         self.has_unplaced = false;
     }
 
-    /// What the messages come to.
+    /// The figures of all messages.
     pub fn finish(mut self) -> DemandMetrics {
         if let Some(reason) = self.refused {
             return DemandMetrics::unjudged(&self.demand, reason);

@@ -174,7 +174,7 @@ fn unknown_fates_are_no_losses_but_may_decide() {
     let found = judged(160, &[(0, unknown), (16, unknown)]);
     assert_eq!(found.verdict, DemandVerdict::NotJudged);
     assert_eq!(judged(160, &[]).verdict, DemandVerdict::NotJudged);
-    // A run that is long enough, but for a second of which nobody knows.
+    // A run that is long enough, but for a second of unknown fates.
     let mut fold = DemandFold::new(&demand(), Some(run(1_600_000)));
     for number in 0..100_000_i64 {
         let is_known = !(50_000..50_063).contains(&number);

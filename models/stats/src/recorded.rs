@@ -412,7 +412,7 @@ pub const ROWS_NOTE: &str = "HiL with a kind of link: recorded runs in real time
 pub const REPLAYS_NOTE: &str = "Replay: the same robots in virtual time over the traces of the runs in the row above, with \
                                 seeds of their own; the verdict is against that row, and agrees where no difference is shown";
 
-/// What the verdicts of a case's replays come to; `None` of none.
+/// How many of a case's replays have which verdict, in words; `None` of none.
 pub fn replays_summary(verdicts: &[Verdict]) -> Option<String> {
     let count = |wanted| verdicts.iter().filter(|one| **one == wanted).count();
     let counts = Verdict::ALL

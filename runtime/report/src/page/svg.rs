@@ -156,7 +156,7 @@ pub(super) fn standalone(svg: &str) -> String {
     }
 }
 
-/// `svg` for what knows neither variables nor media in a style sheet: with the colours for print.
+/// `svg` for renderers without variables and media queries in style sheets: with the colours for print.
 pub(super) fn for_print(svg: &str) -> String {
     let (plain, rules) = STYLE
         .split_once("svg.figure {")

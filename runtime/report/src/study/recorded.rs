@@ -18,7 +18,7 @@ use crate::answer::{Answer, is_score_incomplete};
 use crate::assessment::Assessment;
 use crate::compare::ComparedRun;
 use crate::link_change::LinkChange;
-use crate::study::recording::replay;
+use crate::study::recording::trace_replay;
 use crate::summary::{
     ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RunSummary, ScoreMetric,
 };
@@ -208,7 +208,7 @@ pub(super) fn recorded(
     if crossing.is_empty() {
         return Err("no channel went over a network, or a model of one".to_owned());
     }
-    let replays = replay::read(&folder)
+    let replays = trace_replay::read(&folder)
         .map_err(|error| error.to_string())?
         .map(|scores| scores.iter().map(|score| by_name(score)).collect());
     Ok(RecordedRun {

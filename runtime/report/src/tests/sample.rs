@@ -138,7 +138,7 @@ fn channels() -> Vec<ChannelSummary> {
     vec![command, status, motion, recorded_channel()]
 }
 
-/// What became of a demand of `arm/command` on one clock, of 4 ms and 12 ms.
+/// A demand of `arm/command` on one clock, judged, of 4 ms and 12 ms.
 pub(crate) fn demand(availability: f64) -> DemandMetrics {
     let demand = Demand {
         latency_max: Duration::from_millis(1),

@@ -117,7 +117,7 @@ impl Files {
         OutageMetrics::of(&found.finish(), Some(end))
     }
 
-    /// What became of a demand on the same channel.
+    /// A demand on the same channel, judged.
     pub(crate) fn demand(&self, demand: &Demand, alignment: Option<Alignment>) -> DemandMetrics {
         self.consult(alignment, |records, context| {
             let mut fold = DemandFold::of_channel(demand, context);

@@ -8,14 +8,14 @@ use std::path::{Path, PathBuf};
 
 use hil_rundir::run_folder::RunFolder;
 
-use super::replay;
+use super::trace_replay;
 
 /// What a kept run needs for tables, reports and comparisons.
 const KEPT: [&str; 4] = [
     "manifest.json",
     "summary.json",
     "report.txt",
-    replay::FOLDER,
+    trace_replay::FOLDER,
 ];
 /// What is large in the folder of a run.
 const LARGE: [&str; 3] = ["records", "traces", "series"];

@@ -3,7 +3,7 @@
 
 mod folder;
 mod next;
-pub(in crate::study) mod replay;
+pub(in crate::study) mod trace_replay;
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, TryLockError};
@@ -636,7 +636,7 @@ impl RunMaker<'_> {
         if let (Ok(Made::Sound { folder, .. }), Part::Run(_)) = (&outcome, part) {
             // After a signal as well: the run is whole, and its traces are not kept.
             let console = &mut *self.console;
-            replay::write(folder, self.registry, &mut || meanwhile(1.0, console))
+            trace_replay::write(folder, self.registry, &mut || meanwhile(1.0, console))
                 .map_err(failed)?;
         }
         Ok(match outcome {
