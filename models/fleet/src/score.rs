@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use crate::case::{FLEET_AUTHORITY, FLEET_STATE, FLEET_TRUTH, Fleet, FleetParameters};
 use crate::events::events;
 use crate::messages::{Authority, State, Truth};
-use crate::referee::{Clearances, Referee, SCAN_PERIOD, Tally};
+use crate::referee::{Clearances, Referee, SCAN_PERIOD, STOP_SCANS, Tally};
 use crate::standing::{Patience, Standstill, standstills};
 use hil_core::case_study::{ErrorSeries, Harm, Metric, Score};
 use hil_core::interval::Spread;
@@ -131,6 +131,16 @@ pub(crate) const CRITICAL_SECTIONS: Label =
 pub(crate) const COLLISION_RATIO: Label =
     label("collision_ratio", "collisions per critical section", "1");
 
+pub(crate) const NEAR_MISSES: Label = label("near_misses_count", "near misses", "1");
+
+pub(crate) const MISSIONS: Label = label("missions_count", "missions done", "1");
+
+pub(crate) const MISSIONS_PER_HOUR: Label = label("missions_per_hour", "missions per hour", "1");
+
+pub(crate) const MISSION_DELAY: Label = label("mission_delay_s", "time lost on missions", "s");
+
+pub(crate) const STOPS: Label = label("stops_count", "stops on missions", "1");
+
 const STANDING: Label = label("standing_s", "time a whole fleet stood", "s");
 
 /// The interval of collisions per critical section on the effective sample of the sections in the order in which they were
@@ -238,7 +248,7 @@ fn clearances(seen: &Clearances, spacing_m: f64) -> Vec<Metric> {
                 2.0 * spacing_m
             ),
         ),
-        label("near_misses_count", "near misses", "1").count(
+        NEAR_MISSES.count(
             seen.near_miss_count(),
             format!(
                 "approaches to less than a pose spacing ({spacing_m:.2} m) without contact"
@@ -366,13 +376,29 @@ fn ages(log: &RunLog) -> Vec<Metric> {
 fn work(tally: &Tally, run_s: f64) -> Vec<Metric> {
     let per_hour = 3600.0 * tally.missions_done_count as f64 / run_s;
     vec![
-        label("missions_count", "missions done", "1").count(
+        MISSIONS.count(
             tally.missions_done_count,
             "driven to their goal, all fleets together",
         ),
-        label("missions_per_hour", "missions per hour", "1").known(
+        MISSIONS_PER_HOUR.known(
             per_hour,
             format!("all fleets together, over the whole run of {run_s:.1} s; missions under way do not count"),
+        ),
+        MISSION_DELAY.known(
+            tally.mission_delay_s,
+            "what they took beyond a drive from rest to rest without a stop, all together",
+        ),
+        label("mission_delay_s_mean", "time lost per mission", "s").measured(
+            tally.mean_mission_delay_s(),
+            "what missions took beyond a drive from rest to rest without a stop",
+            "no mission was done",
+        ),
+        STOPS.count(
+            tally.stops_count,
+            format!(
+                "robots on a mission that stood still for {:.1} s or longer, also before they set out",
+                f64::from(STOP_SCANS) * SCAN_PERIOD.as_secs_f64()
+            ),
         ),
         label("travelled_km", "way driven", "km")
             .known(tally.travelled_m * 1e-3, "by all robots of all fleets"),

@@ -20,6 +20,18 @@ pub struct Vehicle {
     pub acceleration_mps2: f64,
 }
 
+impl Vehicle {
+    /// The time from rest to rest over `way_m` with all that it can do, seconds.
+    pub fn least_time_s(&self, way_m: f64) -> f64 {
+        let ramp_s = self.speed_max_mps / self.acceleration_mps2;
+        if way_m < self.speed_max_mps * ramp_s {
+            2.0 * (way_m / self.acceleration_mps2).sqrt()
+        } else {
+            way_m / self.speed_max_mps + ramp_s
+        }
+    }
+}
+
 /// A place where a robot parks; paths begin and end in bays.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bay {

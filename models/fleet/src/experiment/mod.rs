@@ -3,6 +3,7 @@
 //! run as processes; only their surroundings differ.
 
 mod cells;
+mod costs;
 mod driver;
 mod recorded;
 mod report;

@@ -2,6 +2,7 @@
 
 use crate::case::FleetParameters;
 use crate::experiment::cells::{Condition, PublishedRow, SCENARIOS, hil_setup, published_rows};
+use crate::experiment::costs::Costs;
 use crate::experiment::driver::Setup;
 use crate::referee::Tally;
 use crate::scenario::{Scenario, WorldParameters};
@@ -23,6 +24,8 @@ pub(crate) struct FleetRow {
     pub(crate) tally: Tally,
     /// The same in virtual time over the traces of its runs.
     pub(crate) replay: Option<Box<Self>>,
+    /// What they paid for their network besides collisions; `None` where the score of a run does not tell.
+    pub(crate) costs: Option<Costs>,
     collided: Vec<RunShare>,
 }
 
@@ -63,6 +66,7 @@ impl FleetRow {
 
     fn of(row: RecordedRow<FleetParameters>) -> Result<Self, StudyRefusal> {
         let (mut tally, mut collided) = (Tally::default(), Vec::new());
+        let mut costs = Some(Costs::default());
         for run in row.runs() {
             let share = Share {
                 count: run.count(COLLISIONS.name)?,
@@ -80,12 +84,16 @@ impl FleetRow {
                 interval: run.interval(COLLISION_RATIO.name),
             });
         }
+        for run in row.runs() {
+            costs = costs.zip(Costs::of_run(run)).map(|(sum, one)| sum + one);
+        }
         let replay = row.replayed().map(Self::of).transpose()?;
         Ok(Self {
             scenario: row.first().parameters.world.scenario,
             row,
             tally,
             replay: replay.map(Box::new),
+            costs,
             collided,
         })
     }
@@ -131,6 +139,7 @@ mod tests {
     use crate::coordinator::parameters::CoordinatorMode;
     use crate::experiment::FleetStudy;
     use crate::robot::TrackerKind;
+    use crate::score::{MISSION_DELAY, MISSIONS, MISSIONS_PER_HOUR, NEAR_MISSES, STOPS};
     use hil_core::interval::{Interval, IntervalMethod, Spread};
     use hil_core::recorded_run::{
         DelayBin, LinkOrigin, PublishedNetwork, RecordedCrossing, RecordedLink, RecordedMetric,
@@ -212,7 +221,10 @@ mod tests {
     fn without_runs_the_tables_are_those_of_virtual_time() {
         let report = report(Vec::new()).unwrap();
         let names: Vec<_> = report.tables.iter().map(|one| one.name.as_str()).collect();
-        assert_eq!(names, ["table-2-harbor", "table-3-warehouse", "motion"]);
+        assert_eq!(
+            names,
+            ["table-2-harbor", "table-3-warehouse", "motion", "costs"]
+        );
         let [harbor, ..] = report.tables.as_slice() else {
             panic!("{report:?}");
         };
@@ -377,6 +389,43 @@ mod tests {
         );
         let last = other.summary.last().unwrap();
         assert!(last.contains("of 1 rows: differs 1;"), "{last}");
+    }
+
+    #[test]
+    fn a_row_has_the_costs_of_its_runs_where_each_score_tells_them() {
+        let short = Some(PublishedNetwork::ShortRange);
+        let plain = run("runs/a", short, Scenario::Harbor, [0, 0, 0, 1_000]);
+        let costs = |runs| {
+            let found = report(runs).unwrap();
+            let table = found.tables.iter().find(|table| table.name == "costs");
+            table.unwrap().rows.last().unwrap()[1..].to_vec()
+        };
+        assert_eq!(costs(vec![plain.clone()]), [const { Cell::Absent }; 5]);
+        // Four fleets for half an hour.
+        let mut told = plain;
+        for (label, value) in [
+            (MISSIONS, 100.0),
+            (MISSIONS_PER_HOUR, 200.0),
+            (MISSION_DELAY, 250.0),
+            (STOPS, 300.0),
+            (NEAR_MISSES, 5.0),
+        ] {
+            let metric = RecordedMetric {
+                value: Some(value),
+                interval: None,
+            };
+            told.score.insert(label.name.to_owned(), metric);
+        }
+        let mut other = told.clone();
+        other.folder = "runs/b".to_owned();
+        let expected = [
+            Cell::Count(200),
+            number(50.0, 0),
+            number(2.5, 2),
+            number(3.0, 2),
+            number(5.0, 1),
+        ];
+        assert_eq!(costs(vec![told, other]), expected);
     }
 
     #[test]

@@ -6,9 +6,10 @@ use crate::experiment::cells::{
     CellSpec, CollidedRun, Condition, Demand, FleetTally, Mechanism, Place, PublishedRow,
     RunFigures, SCENARIOS, per_1000_interval, published_rows,
 };
+use crate::experiment::costs::{COSTS, Costs};
 use crate::experiment::recorded::FleetRow;
 use crate::experiment::study::{FleetStudy, worlds_text};
-use crate::referee::Tally;
+use crate::referee::{SCAN_PERIOD, STOP_SCANS, Tally};
 use crate::scenario::Scenario;
 use hil_core::study::{self, Cell, Column, Criterion, Field, Larger, StudyReport, Table, Verdict};
 use hil_link::impaired::DelayLaw;
@@ -126,6 +127,7 @@ pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyRep
         tables.extend(SCENARIOS.map(|scenario| mechanism_table(scenario, results)));
         tables.push(command_table(results));
     }
+    tables.push(costs_table(results, &recorded));
     let verdicts: Vec<_> = results.iter().filter_map(verdict_against).collect();
     let criteria = criteria(results);
     let named = verdicts.iter();
@@ -481,7 +483,7 @@ fn judged(one: &CellResult<'_>, judge: Judge) -> Cell {
     Cell::text(format!("{text}: {verdict}"))
 }
 
-const MOTION: [Field<FleetTally>; 12] = [
+const MOTION: [Field<FleetTally>; 11] = [
     Field::number("separation_min_m", "Closest m", 2, |t| {
         t.referee.separation_min_m
     }),
@@ -505,12 +507,6 @@ const MOTION: [Field<FleetTally>; 12] = [
         t.coordinator.deadlocks_broken
     }),
     Field::count("resets", "Resets", |t| t.coordinator.resets),
-    Field::number(
-        "missions_per_hour",
-        "Missions/h",
-        0,
-        FleetTally::missions_per_hour,
-    ),
     Field::number("robot_km", "Robot-km", 0, |t| {
         Some(1e-3 * t.referee.travelled_m)
     }),
@@ -617,7 +613,7 @@ fn mechanism_table(scenario: Scenario, results: &[CellResult<'_>]) -> Table {
     }
 }
 
-const COMMANDS: [Field<FleetTally>; 13] = [
+const COMMANDS: [Field<FleetTally>; 12] = [
     Field::count("commands", "Commands", |t| t.commands.offered_count),
     Field::count("commands_lost", "Lost", |t| t.commands.lost_count),
     Field::count("states", "States", |t| t.status.offered_count),
@@ -640,16 +636,6 @@ const COMMANDS: [Field<FleetTally>; 13] = [
     Field::number("separation_min_m", "Closest m", 2, |t| {
         t.referee.separation_min_m
     }),
-    Field::number(
-        "near_misses_per_1000",
-        "Near misses x 1000",
-        1,
-        |t: &FleetTally| {
-            let near_misses = t.referee.clearances.near_miss_count();
-            (t.section_count() > 0).then(|| 1e3 * near_misses as f64 / t.section_count() as f64)
-        },
-    )
-    .ranked(1),
 ];
 
 /// What became of the commands in each cell of the table of mechanisms.
@@ -662,15 +648,53 @@ fn command_table(results: &[CellResult<'_>]) -> Table {
             "late: too late to stop at; ignored: behind the robot, which drove on; refused: not \
              applied because it could not stop (safe); stale: older than one applied"
                 .to_owned(),
-            "near misses: two robots under way within a pose spacing of each other without contact, \
-             per CS; counted once until they are two spacings apart"
-                .to_owned(),
         ],
         ..by_cell(
             "Cell",
             &COMMANDS,
             results.iter().filter(|one| one.is_mechanism()),
         )
+    }
+}
+
+/// What each network cost besides collisions, in virtual time and in recorded runs.
+fn costs_table(results: &[CellResult<'_>], recorded: &[RecordedResult<'_>]) -> Table {
+    let row = |name: String, costs: Option<&Costs>| {
+        let mut row = vec![Cell::text(name)];
+        row.extend(Field::cells(&COSTS, costs));
+        row
+    };
+    let mut rows: Vec<_> = (results.iter())
+        .map(|one| {
+            let costs = one.tally.as_ref().map(Costs::of_tally);
+            row(one.cell.id.to_string(), costs.as_ref())
+        })
+        .collect();
+    for one in recorded {
+        let both = [Some(one), one.replay.as_deref()].into_iter().flatten();
+        rows.extend(both.map(|one| {
+            let name = format!("{}, {}", one.of.scenario, one.of.row.method());
+            row(name, one.of.costs.as_ref())
+        }));
+    }
+    let mut columns = vec![Column::new("cell", "Row")];
+    columns.extend(Field::columns(&COSTS));
+    Table {
+        name: "costs".to_owned(),
+        title: "What each network costs besides collisions".to_owned(),
+        columns,
+        rows,
+        is_detail: true,
+        notes: vec![
+            format!(
+                "missions/h: of one fleet; lost: what a mission took beyond a drive from rest to rest without a stop; \
+                 stop: {:.1} s or longer, also before setting out",
+                f64::from(STOP_SCANS) * SCAN_PERIOD.as_secs_f64()
+            ),
+            "near misses: two robots under way within a pose spacing of each other without contact, \
+             per CS; counted once until they are two spacings apart"
+                .to_owned(),
+        ],
     }
 }
 

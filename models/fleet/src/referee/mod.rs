@@ -36,6 +36,9 @@ use hil_core::time::Instant;
 /// From scan to scan.
 pub const SCAN_PERIOD: Duration = Duration::from_millis(30);
 
+/// A robot that stands for so many scans has stopped. The stepped tracker stands between its ticks.
+pub(crate) const STOP_SCANS: u32 = 10;
+
 /// Incidents kept; more are counted.
 pub const INCIDENTS_MAX: usize = 10_000;
 
@@ -112,7 +115,11 @@ impl Referee {
             TruthKind::AuthorityApplied => track.is_late = false,
             TruthKind::AuthorityLate => track.is_late = true,
             TruthKind::MissionStarted => self.begin_mission(robot, truth),
-            TruthKind::MissionDone => self.end_mission(robot, true),
+            TruthKind::MissionDone => {
+                self.tally.mission_delay_s +=
+                    self.tracks[robot].mission_delay_s(truth, &self.world.vehicle);
+                self.end_mission(robot, true);
+            }
             TruthKind::Replaced => self.end_mission(robot, false),
             _ => {}
         }
@@ -128,6 +135,7 @@ impl Referee {
             if track.look(now) && track.is_driving {
                 self.sections.update(robot, track.index, &mut self.tally);
             }
+            self.tally.stops_count += u64::from(track.has_stopped());
         }
         for position in 0..self.finder.find(&self.tracks) {
             let pair = self.finder.found(position);
@@ -212,6 +220,11 @@ impl Referee {
         let track = &mut self.tracks[robot];
         track.is_driving = true;
         track.is_late = false;
+        track.begun = MissionStart {
+            at: Instant::from_ns(truth.at_ns),
+            way_m: truth.travelled_m,
+        };
+        track.still_count = 0;
         track.cause = Cause::default();
         track.index = track
             .path
@@ -343,7 +356,17 @@ pub(crate) struct Track {
     pub(crate) position: [f64; 2],
     /// It stands elsewhere than at the scan before.
     pub(crate) has_moved: bool,
+    /// Scans at which it stood still on its mission, one after the other.
+    still_count: u32,
+    begun: MissionStart,
     stand: Pose,
+}
+
+/// When a mission began, and where on its path.
+#[derive(Debug, Clone, Copy)]
+struct MissionStart {
+    at: Instant,
+    way_m: f64,
 }
 
 impl Track {
@@ -364,6 +387,11 @@ impl Track {
             index: 0,
             position: [stand.x_m, stand.y_m],
             has_moved: true,
+            still_count: 0,
+            begun: MissionStart {
+                at: Instant::ZERO,
+                way_m: 0.0,
+            },
             stand,
         }
     }
@@ -432,6 +460,23 @@ impl Track {
         has_passed
     }
 
+    /// After a look: it has now stood still on its mission for [`STOP_SCANS`] scans.
+    fn has_stopped(&mut self) -> bool {
+        if self.has_moved || !self.is_driving {
+            self.still_count = 0;
+        } else {
+            self.still_count = self.still_count.saturating_add(1);
+        }
+        self.still_count == STOP_SCANS
+    }
+
+    /// How much longer the mission that is `done` took than a drive without a stop, seconds.
+    fn mission_delay_s(&self, done: &Truth, vehicle: &Vehicle) -> f64 {
+        let way_m = (done.travelled_m - self.begun.way_m).max(0.0);
+        let taken_s = Instant::from_ns(done.at_ns).seconds_since(self.begun.at);
+        (taken_s - vehicle.least_time_s(way_m)).max(0.0)
+    }
+
     /// The ground it covered at the last look.
     pub(crate) fn covered(&self, vehicle: &Vehicle) -> OrientedBox {
         let pose = match &self.path {
@@ -486,6 +531,10 @@ hil_core::counts! {
         missions_started_count: u64;
         /// Missions driven to their goal.
         missions_done_count: u64;
+        /// How much longer those took than drives without a stop, all together, seconds.
+        mission_delay_s: f64;
+        /// Times a robot stood still on its mission for [`STOP_SCANS`] scans or longer; before it set out too.
+        stops_count: u64;
         /// Robots put at their goal to clear a stuck fleet.
         replaced_count: u64;
         /// Authorities applied in time.
@@ -514,6 +563,12 @@ fn least(one: Option<f64>, other: Option<f64>) -> Option<f64> {
 }
 
 impl Tally {
+    /// How much longer a mission took than a drive without a stop, seconds; `None` where none was done.
+    pub(crate) fn mean_mission_delay_s(&self) -> Option<f64> {
+        (self.missions_done_count > 0)
+            .then(|| self.mission_delay_s / self.missions_done_count as f64)
+    }
+
     pub(crate) fn count_kind(&mut self, kind: TruthKind) {
         match kind {
             TruthKind::Motion => {}

@@ -116,6 +116,42 @@ fn a_planted_collision_is_seen_by_both_checkers_and_a_clear_pass_by_none() {
 }
 
 #[test]
+fn a_mission_loses_what_it_took_beyond_a_drive_without_a_stop() {
+    // 40 m at 2 m/s and 1 m/s^2 take 22 s. A robot that stops half way is there after 12 s and, sent on at 20.01 s, needs 12 s more.
+    let scene = scene(Scenario::Crossing);
+    let path = scene.world.paths.get(PathId(0)).unwrap();
+    let half = i32::try_from(path.last_index() / 2).unwrap();
+    assert!((path.way_to_m(path.last_index() / 2) - 20.0).abs() < 1e-6);
+    let drive = |first: i32| {
+        let mut referee = Referee::new(&scene, 1);
+        let mut robot = robot(&scene, 0, &RobotParameters::default());
+        for step in 0..1_200 {
+            let now = at(0.03 * f64::from(step));
+            run(&mut robot, now, &mut |truth| referee.on_truth(&truth));
+            if step == 0 {
+                let mission = mission(&scene, 0, 1, 0);
+                robot.on_mission(now, &mission, &mut |truth| referee.on_truth(&truth));
+                let go = authority(1, 1, first, 0);
+                robot.on_authority(now, &go, &mut |truth| referee.on_truth(&truth));
+            } else if step == 667 {
+                let go = authority(1, 2, TO_GOAL, 0);
+                robot.on_authority(now, &go, &mut |truth| referee.on_truth(&truth));
+            }
+            referee.scan(now);
+        }
+        *referee.tally()
+    };
+    let straight = drive(TO_GOAL);
+    assert_eq!((straight.missions_done_count, straight.stops_count), (1, 0));
+    assert!(straight.mission_delay_s < 1e-6, "{straight:?}");
+    let stopped = drive(half);
+    assert_eq!((stopped.missions_done_count, stopped.stops_count), (1, 1));
+    let lost_s = stopped.mean_mission_delay_s().unwrap();
+    assert!((lost_s - 10.01).abs() < 1e-6, "{lost_s}");
+    assert!((scene.world.vehicle.least_time_s(1.0) - 2.0).abs() < 1e-9);
+}
+
+#[test]
 fn a_replay_of_sorted_records_gives_the_same_tally() {
     let scene = scene(Scenario::Crossing);
     let mut records = Vec::new();
