@@ -4,14 +4,14 @@
 use std::collections::BTreeMap;
 
 use hil_account::network::NetworkMetrics;
-use hil_account::{ChannelAccount, FateCounts, MessageFate};
+use hil_account::{ChannelAccount, FateCounts, MessageFate, ServiceMetrics};
 use hil_core::interval::{Interval, Spread, TooSmall};
 use hil_stats::comparison::{Estimate, Share, difference, mean_interval, none_of, ratio, welch};
 use hil_stats::histogram::{Distribution, LatencySummary};
 use hil_stats::statistics::CONFIDENCE;
 
 use super::{ChartKind, ComparedMetric, ComparedRun, Part, Verdict};
-use crate::summary::ScoreMetric;
+use crate::summary::{ChannelSummary, ScoreMetric};
 
 const RANKS: &str = "ranks of the effective sample of each run, ratio by MOVER of the logarithms";
 const REPETITIONS: &str = "Welch's interval over the repetitions";
@@ -436,12 +436,12 @@ struct NetworkFigure {
     metric: &'static str,
     kind: ChartKind,
     unit: &'static str,
-    of: fn(&NetworkMetrics, &ChannelAccount) -> Option<f64>,
+    of: fn(&NetworkMetrics, &ChannelSummary) -> Option<f64>,
 }
 
-/// Beside loss and delay: order by RFC 4737, copies by RFC 5560, losses in a row by RFC 3357, and both forms of delay variation
-/// by RFC 5481. The account defines them.
-const NETWORK: [NetworkFigure; 5] = [
+/// Beside loss and delay: order by RFC 4737, copies by RFC 5560, losses in a row by RFC 3357, both forms of delay variation
+/// by RFC 5481, and, where a demand is stated, what it is judged by. The account defines them.
+const NETWORK: [NetworkFigure; 7] = [
     NetworkFigure {
         metric: "reordered",
         kind: ChartKind::Loss,
@@ -452,10 +452,23 @@ const NETWORK: [NetworkFigure; 5] = [
         metric: "duplicated",
         kind: ChartKind::Loss,
         unit: "1",
-        of: |figures, account| {
-            let share = account.duplicated_count? as f64 / figures.arrived_count as f64;
+        of: |figures, channel| {
+            let duplicated_count = channel.account.as_ref()?.duplicated_count?;
+            let share = duplicated_count as f64 / figures.arrived_count as f64;
             share.is_finite().then_some(share)
         },
+    },
+    NetworkFigure {
+        metric: "not_in_time",
+        kind: ChartKind::Loss,
+        unit: "1",
+        of: |_, channel| Some(1.0 - service(channel)?.reliability),
+    },
+    NetworkFigure {
+        metric: "service_down",
+        kind: ChartKind::Loss,
+        unit: "1",
+        of: |_, channel| Some(1.0 - service(channel)?.availability),
     },
     NetworkFigure {
         metric: "loss_run_max",
@@ -480,6 +493,11 @@ const NETWORK: [NetworkFigure; 5] = [
     },
 ];
 
+/// The service by the limits of the channel's demand; `None` without one, and where it was not judged.
+fn service(channel: &ChannelSummary) -> Option<&ServiceMetrics> {
+    channel.demand.as_ref()?.service.measured()
+}
+
 /// The figures of [`NETWORK`] of each channel.
 fn network(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
     let of = [base.len(), new.len()];
@@ -494,8 +512,9 @@ fn network(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
         {
             let side = |runs: &[ComparedRun]| -> Vec<Estimate> {
                 let found = runs.iter().filter_map(|run| {
-                    let (_, account) = accounts(run).find(|(name, _)| *name == channel)?;
-                    value(network_of(run, &channel)?, account)
+                    let mut channels = run.summary.channels.iter();
+                    let found = channels.find(|one| one.name == channel)?;
+                    value(network_of(run, &channel)?, found)
                 });
                 found
                     .map(|value| Estimate {

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use hil_core::interval::{Interval, Spread};
-use hil_platform::text::grouped;
+use hil_platform::text::{grouped, shell_words};
 use hil_platform::words::counted;
 use hil_present::template::{TemplateError, markdown as document};
 use hil_present::terminal::canvas::{Canvas, Style};
@@ -244,8 +244,16 @@ fn resolve(section: &mut Section, comparison: &Comparison) {
         "more repetitions on both sides, each with a seed of its own:".to_owned()
     };
     section.fact("to resolve it", Tone::Plain, words);
+    let folders = |runs: &[PathBuf]| {
+        let names = runs.iter().map(|run| run.display().to_string());
+        shell_words(&names.collect::<Vec<_>>())
+    };
     section.blocks.push(Block::Command {
-        text: "hil-runtime compare --base BASE-RUNS --new NEW-RUNS".to_owned(),
+        text: format!(
+            "hil-runtime compare --base {} MORE-BASE-RUNS --new {} MORE-NEW-RUNS",
+            folders(&comparison.base),
+            folders(&comparison.new)
+        ),
     });
 }
 

@@ -78,12 +78,8 @@ impl AnswerFacts {
         let has_interval = intervals.any(|one| matches!(one, Some(Spread::Known(_))));
         let note = if has_interval { "; brackets: 95 %" } else { "" };
         let links = link_words(summary);
-        let over = match transports(summary).as_slice() {
-            [] => String::new(),
-            all => format!(" over {}", all.join(" and ")),
-        };
         rest.extend(links.map(|words| Field::new("emulated link", words)));
-        let words = format!("{}{note}", answer.sample_words(&over));
+        let words = format!("{}{note}", answer.sample_words());
         rest.push(Field::new("sample", words));
         Self {
             measurement: Field::toned("measurement", tone, validity),

@@ -220,3 +220,33 @@ fn what_the_network_did_beside_losing_is_compared_by_the_accounts_definitions() 
         (Some(Part::Network), Some(1.0))
     );
 }
+
+#[test]
+fn channels_with_a_demand_are_compared_by_what_it_is_judged_by() {
+    let run = |availability| {
+        let mut summary = crate::tests::sample::full();
+        let mut demand = crate::tests::sample::demand(0.9);
+        let Metric::Measured(service) = &mut demand.service else {
+            panic!("it is judged: {demand:?}");
+        };
+        service.availability = availability;
+        summary.channels[0].demand = Some(demand);
+        ComparedRun {
+            folder: "run".into(),
+            topology: serde_json::Value::Null,
+            summary,
+        }
+    };
+    let runs = [0.9, 0.99].map(|availability| [run(availability)]);
+    let figures = network(&runs[0], &runs[1]);
+    let down: Vec<_> = figures
+        .iter()
+        .filter(|one| one.metric == "service_down")
+        .collect();
+    let [down] = down.as_slice() else {
+        panic!("one channel has a demand: {down:?}");
+    };
+    let [base, new] = [down.base, down.new].map(|one| one.unwrap().value);
+    assert!((base - 0.1).abs() < 1e-9 && (new - 0.01).abs() < 1e-9);
+    assert!(figures.iter().any(|one| one.metric == "not_in_time"));
+}
