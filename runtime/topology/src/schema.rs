@@ -163,9 +163,9 @@ fn one_line(about: &str) -> String {
 /// What stands above the generated part of the reference page.
 const HEAD: &str = "# Keys of a topology file
 
-Made from the declarations of the tables; `hil-runtime documents FOLDER` writes the same as a JSON Schema. A key without a
-default may be left out unless it is required. Durations are texts with a unit (h, min, s, ms, us, ns). What several
-keys say together is checked by `hil-runtime --topology FILE --check`, which also prints every key in force.
+Made from the declarations of the tables (not to be edited: CONTRIBUTING.md, \"To add\"); `hil-runtime documents FOLDER` writes the
+same as a JSON Schema. A key without a default may be left out unless it is required. Durations are texts with a unit (h, min, s, ms,
+us, ns). What several keys say together is checked by `hil-runtime --topology FILE --check`, which also prints every key in force.
 ";
 
 /// The reference page of all keys of a topology file, in Markdown. Tables with equal keys share a section.

@@ -7,7 +7,7 @@ use hil_account::network::network_series_name;
 
 use super::read::{Found, Manifest, Material};
 use super::series::{Series, parse};
-use super::{FigureFile, Format, PAGE_BYTES_MAX, figure_files, page_of, render};
+use super::{FigureFile, Format, PAGE_BYTES_MAX, figure_files, page_of, render, write};
 use crate::network::TimelineSubject;
 use crate::summary::{Fact, RunSummary};
 use crate::terminal::Style;
@@ -211,6 +211,23 @@ fn runs_that_went_wrong_get_pages_that_say_so() {
             assert!(!text.contains("NaN"), "{format:?}");
         }
     }
+}
+
+#[test]
+fn a_report_of_any_form_is_known_for_one_that_may_be_replaced() {
+    let path = std::env::temp_dir().join(format!("hil-forms-{}", std::process::id()));
+    let material = [material(full())];
+    let forms = Format::value_variants().iter();
+    // Figures are files of their own.
+    for format in forms.filter(|one| !matches!(one, Format::Svg | Format::Pdf)) {
+        let text = match format {
+            Format::Html => html(&material[0]),
+            format => render(&material, None, *format, None).unwrap(),
+        };
+        write::write(&path, text).unwrap();
+        write::check(&path, false).unwrap_or_else(|error| panic!("{format:?}: {error}"));
+    }
+    std::fs::remove_file(path).unwrap();
 }
 
 #[test]

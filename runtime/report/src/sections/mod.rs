@@ -1,5 +1,5 @@
-//! A run as the sections of a report: what each says is made here once, for every form. Nothing is measured or
-//! judged here.
+//! A run as the sections of a report: what each says is made here once. CSV takes their metrics, LaTeX score and
+//! channels. Nothing is measured or judged here.
 
 mod adapter;
 mod answer;
