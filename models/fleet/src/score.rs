@@ -2,6 +2,7 @@
 //! and the robots said to each other tells the rest. It makes no tables; those are the
 //! experiment's.
 
+use core::time::Duration;
 use std::collections::BTreeMap;
 
 use crate::case::{FLEET_AUTHORITY, FLEET_STATE, FLEET_TRUTH, Fleet, FleetParameters};
@@ -59,7 +60,9 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
         .extend(clearances(&tally.clearances, referee.spacing_m()));
     score.metrics.extend(commands(tally));
     score.metrics.extend(ages(log));
-    score.metrics.extend(work(tally, run_s));
+    score
+        .metrics
+        .extend(work(tally, run_s, case.parameters().robot.longest_tick()));
     let standing_s: f64 = standing.iter().map(Standstill::duration_s).sum();
     let method = format!(
         "no robot of a fleet moved for more than {} s, or at all; all fleets together",
@@ -137,7 +140,13 @@ pub(crate) const MISSIONS: Label = label("missions_count", "missions done", "1")
 
 pub(crate) const MISSIONS_PER_HOUR: Label = label("missions_per_hour", "missions per hour", "1");
 
-pub(crate) const MISSION_DELAY: Label = label("mission_delay_s", "time lost on missions", "s");
+pub(crate) const MISSIONS_BEGUN: Label = label("missions_begun_count", "missions begun", "1");
+
+pub(crate) const MISSION_DELAY: Label = label("mission_delay_s_mean", "time lost per mission", "s");
+
+pub(crate) const RUN_LENGTH: Label = label("run_s", "length of the run", "s");
+
+pub(crate) const RESETS: Label = label("resets_count", "resets", "1");
 
 pub(crate) const STOPS: Label = label("stops_count", "stops on missions", "1");
 
@@ -373,7 +382,25 @@ fn ages(log: &RunLog) -> Vec<Metric> {
     figures.collect()
 }
 
-fn work(tally: &Tally, run_s: f64) -> Vec<Metric> {
+/// Robots that stood still on their missions.
+fn stops(tally: &Tally, longest_tick: Duration) -> Metric {
+    let stop = STOP_SCANS * SCAN_PERIOD;
+    if 2 * longest_tick > stop {
+        return STOPS.unavailable(format!(
+            "between its ticks of up to {:.2} s a robot under way stands as long as in a stop",
+            longest_tick.as_secs_f64()
+        ));
+    }
+    STOPS.count(
+        tally.stops_count,
+        format!(
+            "robots on a mission that stood still for {:.1} s or longer, also before they set out",
+            stop.as_secs_f64()
+        ),
+    )
+}
+
+fn work(tally: &Tally, run_s: f64, longest_tick: Duration) -> Vec<Metric> {
     let per_hour = 3600.0 * tally.missions_done_count as f64 / run_s;
     vec![
         MISSIONS.count(
@@ -384,25 +411,18 @@ fn work(tally: &Tally, run_s: f64) -> Vec<Metric> {
             per_hour,
             format!("all fleets together, over the whole run of {run_s:.1} s; missions under way do not count"),
         ),
-        MISSION_DELAY.known(
-            tally.mission_delay_s,
-            "what they took beyond a drive from rest to rest without a stop, all together",
-        ),
-        label("mission_delay_s_mean", "time lost per mission", "s").measured(
+        MISSION_DELAY.measured(
             tally.mean_mission_delay_s(),
-            "what missions took beyond a drive from rest to rest without a stop",
-            "no mission was done",
+            "from a mission's arrival at its robot to its goal, beyond a drive from rest to rest without a stop by the \
+             vehicle's limits, which the stepped tracker exceeds by up to a tick; of missions done",
+            "no mission whose beginning was recorded was done",
         ),
-        STOPS.count(
-            tally.stops_count,
-            format!(
-                "robots on a mission that stood still for {:.1} s or longer, also before they set out",
-                f64::from(STOP_SCANS) * SCAN_PERIOD.as_secs_f64()
-            ),
-        ),
+        MISSIONS_BEGUN.count(tally.missions_started_count, "taken by a robot"),
+        stops(tally, longest_tick),
+        RUN_LENGTH.known(run_s, "from the first record of a robot to the last"),
         label("travelled_km", "way driven", "km")
             .known(tally.travelled_m * 1e-3, "by all robots of all fleets"),
-        label("resets_count", "resets", "1").count(
+        RESETS.count(
             tally.replaced_count,
             "robots put at their goal to clear a stuck fleet",
         ),
@@ -415,9 +435,6 @@ fn work(tally: &Tally, run_s: f64) -> Vec<Metric> {
 
 #[cfg(test)]
 mod tests {
-    use core::time::Duration;
-    use std::collections::BTreeMap;
-
     use super::*;
     use crate::coordinator::parameters::CoordinatorMode;
     use crate::scenario::Scenario;

@@ -435,14 +435,14 @@ impl Answer {
     }
 
     /// How large the sample is, `over` which transports, in words.
-    pub(crate) fn sample_words(&self) -> String {
+    pub(crate) fn sample_words(&self, over: &str) -> String {
         let Sample {
             duration_s: length_s,
             channel_count,
             message_count,
             occasions,
         } = &self.sample;
-        let length = format!("in {length_s:.1}{JOINT}s");
+        let length = format!("in {length_s:.1}{JOINT}s{over}");
         match occasions {
             Some(OccasionCount { what, count }) if *count < OCCASIONS_MIN => {
                 format!("{count} {what} {length}, too few for a rate, which takes {OCCASIONS_MIN}")

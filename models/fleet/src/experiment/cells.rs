@@ -487,8 +487,13 @@ impl FleetTally {
 
     /// Missions driven to their end per hour of the fleet; `None` before it ran.
     pub fn missions_per_hour(&self) -> Option<f64> {
-        (self.run_s > 0.0).then(|| 3600.0 * self.referee.missions_done_count as f64 / self.run_s)
+        missions_per_hour(self.referee.missions_done_count, self.run_s)
     }
+}
+
+/// Missions done per hour of a fleet that ran for so long.
+pub(crate) fn missions_per_hour(done_count: u64, fleet_s: f64) -> Option<f64> {
+    (fleet_s > 0.0).then(|| 3600.0 * done_count as f64 / fleet_s)
 }
 
 /// The exact interval of collisions per 1000 critical sections, both counts divided by `scatter` (Korn and Graubard 1998).

@@ -1,12 +1,13 @@
-//! What a network costs a fleet besides collisions: near misses, stops, and time. One set of figures for virtual time and
-//! recorded runs.
+//! Near misses, stops and time lost: what a network does to a fleet besides collisions. One set of figures for virtual time
+//! and recorded runs.
 
 use core::ops::Add;
 
 use crate::case::FleetParameters;
-use crate::experiment::cells::FleetTally;
+use crate::experiment::cells::{FleetTally, missions_per_hour};
 use crate::score::{
-    CRITICAL_SECTIONS, MISSION_DELAY, MISSIONS, MISSIONS_PER_HOUR, NEAR_MISSES, STOPS,
+    CRITICAL_SECTIONS, MISSION_DELAY, MISSIONS, MISSIONS_BEGUN, NEAR_MISSES, RESETS, RUN_LENGTH,
+    STOPS,
 };
 use hil_core::recorded_run::RecordedRun;
 use hil_core::study::Field;
@@ -16,12 +17,16 @@ use hil_core::study::Field;
 pub(crate) struct Costs {
     section_count: u64,
     near_miss_count: u64,
-    mission_count: u64,
+    begun_count: u64,
+    done_count: u64,
+    reset_count: u64,
+    /// Stops on all missions begun.
     stop_count: u64,
-    /// Of the missions done, seconds.
-    mission_delay_s: f64,
-    /// Run time of one fleet, hours.
-    fleet_hours: f64,
+    /// Of the missions whose time lost is known, seconds.
+    lost_s: f64,
+    timed_count: u64,
+    /// Run time of one fleet, seconds.
+    fleet_s: f64,
 }
 
 impl Costs {
@@ -31,33 +36,41 @@ impl Costs {
         Self {
             section_count: seen.sections_passed_count,
             near_miss_count: seen.clearances.near_miss_count(),
-            mission_count: seen.missions_done_count,
+            begun_count: seen.missions_started_count,
+            done_count: seen.missions_done_count,
+            reset_count: seen.replaced_count,
             stop_count: seen.stops_count,
-            mission_delay_s: seen.mission_delay_s,
-            fleet_hours: tally.run_s / 3600.0,
+            lost_s: seen.mission_delay_s,
+            timed_count: seen.missions_timed_count,
+            fleet_s: tally.run_s,
         }
     }
 
-    /// Of a recorded run; `None` where its score has not all of them.
+    /// Of a recorded run; `None` where its score has not all counts and its length.
     pub(crate) fn of_run(run: &RecordedRun<FleetParameters>) -> Option<Self> {
         let value = |name: &str| run.score.get(name).and_then(|metric| metric.value);
         let count = |name: &str| run.count(name).ok();
-        let mission_count = count(MISSIONS.name)?;
-        // All fleets together.
-        let per_hour = value(MISSIONS_PER_HOUR.name).filter(|rate| *rate > 0.0)?;
+        let done_count = count(MISSIONS.name)?;
+        // Without a mission done there is no mean.
+        let mean_s = value(MISSION_DELAY.name);
+        let timed_count = if mean_s.is_some() { done_count } else { 0 };
         Some(Self {
             section_count: count(CRITICAL_SECTIONS.name)?,
             near_miss_count: count(NEAR_MISSES.name)?,
-            mission_count,
+            begun_count: count(MISSIONS_BEGUN.name)?,
+            done_count,
+            reset_count: count(RESETS.name)?,
             stop_count: count(STOPS.name)?,
-            mission_delay_s: value(MISSION_DELAY.name)?,
-            fleet_hours: mission_count as f64 / per_hour * f64::from(run.parameters.fleets),
+            lost_s: mean_s.map_or(0.0, |mean_s| mean_s * done_count as f64),
+            timed_count,
+            fleet_s: value(RUN_LENGTH.name)? * f64::from(run.parameters.fleets),
         })
     }
+}
 
-    fn per_mission(&self, sum: f64) -> Option<f64> {
-        (self.mission_count > 0).then(|| sum / self.mission_count as f64)
-    }
+/// `None` of none.
+fn per(sum: f64, count: u64) -> Option<f64> {
+    (count > 0).then(|| sum / count as f64)
 }
 
 impl Add for Costs {
@@ -67,39 +80,41 @@ impl Add for Costs {
         Self {
             section_count: self.section_count + other.section_count,
             near_miss_count: self.near_miss_count + other.near_miss_count,
-            mission_count: self.mission_count + other.mission_count,
+            begun_count: self.begun_count + other.begun_count,
+            done_count: self.done_count + other.done_count,
+            reset_count: self.reset_count + other.reset_count,
             stop_count: self.stop_count + other.stop_count,
-            mission_delay_s: self.mission_delay_s + other.mission_delay_s,
-            fleet_hours: self.fleet_hours + other.fleet_hours,
+            lost_s: self.lost_s + other.lost_s,
+            timed_count: self.timed_count + other.timed_count,
+            fleet_s: self.fleet_s + other.fleet_s,
         }
     }
 }
 
 /// Their columns.
-pub(crate) const COSTS: [Field<Costs>; 5] = [
-    Field::count("missions", "Missions", |costs: &Costs| costs.mission_count),
-    Field::number("missions_per_hour", "Missions/h", 0, |costs: &Costs| {
-        (costs.fleet_hours > 0.0).then(|| costs.mission_count as f64 / costs.fleet_hours)
+pub(crate) const COSTS: [Field<Costs>; 7] = [
+    Field::count("missions_begun", "Begun", |one: &Costs| one.begun_count),
+    Field::count("missions_done", "Done", |one: &Costs| one.done_count),
+    Field::count("resets", "Resets", |one: &Costs| one.reset_count),
+    Field::number("fleet_missions_per_hour", "Missions/h", 0, |one: &Costs| {
+        missions_per_hour(one.done_count, one.fleet_s)
     }),
     Field::number(
-        "mission_delay_s",
+        "mission_delay_s_mean",
         "Lost per mission s",
         2,
-        |costs: &Costs| costs.per_mission(costs.mission_delay_s),
+        |one: &Costs| per(one.lost_s, one.timed_count),
     ),
     Field::number(
         "stops_per_mission",
         "Stops per mission",
         2,
-        |costs: &Costs| costs.per_mission(costs.stop_count as f64),
+        |one: &Costs| per(one.stop_count as f64, one.begun_count),
     ),
     Field::number(
         "near_misses_per_1000",
         "Near misses x 1000",
         1,
-        |costs: &Costs| {
-            (costs.section_count > 0)
-                .then(|| 1e3 * costs.near_miss_count as f64 / costs.section_count as f64)
-        },
+        |one: &Costs| per(1e3 * one.near_miss_count as f64, one.section_count),
     ),
 ];

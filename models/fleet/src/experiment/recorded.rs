@@ -24,7 +24,7 @@ pub(crate) struct FleetRow {
     pub(crate) tally: Tally,
     /// The same in virtual time over the traces of its runs.
     pub(crate) replay: Option<Box<Self>>,
-    /// What they paid for their network besides collisions; `None` where the score of a run does not tell.
+    /// Near misses, stops and time lost; `None` where the score of a run does not tell.
     pub(crate) costs: Option<Costs>,
     collided: Vec<RunShare>,
 }
@@ -83,8 +83,6 @@ impl FleetRow {
                 share,
                 interval: run.interval(COLLISION_RATIO.name),
             });
-        }
-        for run in row.runs() {
             costs = costs.zip(Costs::of_run(run)).map(|(sum, one)| sum + one);
         }
         let replay = row.replayed().map(Self::of).transpose()?;
@@ -139,12 +137,15 @@ mod tests {
     use crate::coordinator::parameters::CoordinatorMode;
     use crate::experiment::FleetStudy;
     use crate::robot::TrackerKind;
-    use crate::score::{MISSION_DELAY, MISSIONS, MISSIONS_PER_HOUR, NEAR_MISSES, STOPS};
+    use crate::score::{
+        MISSION_DELAY, MISSIONS, MISSIONS_BEGUN, NEAR_MISSES, RESETS, RUN_LENGTH, STOPS,
+    };
     use hil_core::interval::{Interval, IntervalMethod, Spread};
     use hil_core::recorded_run::{
         DelayBin, LinkOrigin, PublishedNetwork, RecordedCrossing, RecordedLink, RecordedMetric,
     };
     use hil_core::study::{Cell, Study, StudyReport, Verdict};
+    use hil_stats::metric::Label;
     use std::collections::BTreeMap;
 
     /// A run of so many collisions, true overlaps, overlaps outside every section, and critical sections.
@@ -400,13 +401,15 @@ mod tests {
             let table = found.tables.iter().find(|table| table.name == "costs");
             table.unwrap().rows.last().unwrap()[1..].to_vec()
         };
-        assert_eq!(costs(vec![plain.clone()]), [const { Cell::Absent }; 5]);
+        assert_eq!(costs(vec![plain.clone()]), [const { Cell::Absent }; 7]);
         // Four fleets for half an hour.
         let mut told = plain;
         for (label, value) in [
+            (MISSIONS_BEGUN, 120.0),
             (MISSIONS, 100.0),
-            (MISSIONS_PER_HOUR, 200.0),
-            (MISSION_DELAY, 250.0),
+            (RESETS, 1.0),
+            (RUN_LENGTH, 1_800.0),
+            (MISSION_DELAY, 2.5),
             (STOPS, 300.0),
             (NEAR_MISSES, 5.0),
         ] {
@@ -416,13 +419,25 @@ mod tests {
             };
             told.score.insert(label.name.to_owned(), metric);
         }
+        // One in which no mission was done counts with its time.
         let mut other = told.clone();
         other.folder = "runs/b".to_owned();
+        let mut set = |label: Label, value| {
+            let metric = RecordedMetric {
+                value,
+                interval: None,
+            };
+            other.score.insert(label.name.to_owned(), metric);
+        };
+        set(MISSIONS, Some(0.0));
+        set(MISSION_DELAY, None);
         let expected = [
-            Cell::Count(200),
-            number(50.0, 0),
+            Cell::Count(240),
+            Cell::Count(100),
+            Cell::Count(2),
+            number(25.0, 0),
             number(2.5, 2),
-            number(3.0, 2),
+            number(2.5, 2),
             number(5.0, 1),
         ];
         assert_eq!(costs(vec![told, other]), expected);

@@ -127,7 +127,9 @@ pub(crate) fn report(study: &FleetStudy, results: &[CellResult<'_>]) -> StudyRep
         tables.extend(SCENARIOS.map(|scenario| mechanism_table(scenario, results)));
         tables.push(command_table(results));
     }
-    tables.push(costs_table(results, &recorded));
+    if !(results.is_empty() && recorded.is_empty()) {
+        tables.push(costs_table(results, &recorded));
+    }
     let verdicts: Vec<_> = results.iter().filter_map(verdict_against).collect();
     let criteria = criteria(results);
     let named = verdicts.iter();
@@ -657,7 +659,7 @@ fn command_table(results: &[CellResult<'_>]) -> Table {
     }
 }
 
-/// What each network cost besides collisions, in virtual time and in recorded runs.
+/// Near misses, stops and time lost, in virtual time and in recorded runs.
 fn costs_table(results: &[CellResult<'_>], recorded: &[RecordedResult<'_>]) -> Table {
     let row = |name: String, costs: Option<&Costs>| {
         let mut row = vec![Cell::text(name)];
@@ -681,16 +683,20 @@ fn costs_table(results: &[CellResult<'_>], recorded: &[RecordedResult<'_>]) -> T
     columns.extend(Field::columns(&COSTS));
     Table {
         name: "costs".to_owned(),
-        title: "What each network costs besides collisions".to_owned(),
+        title: "Besides collisions: missions, time lost, stops and near misses".to_owned(),
         columns,
         rows,
         is_detail: true,
         notes: vec![
             format!(
-                "missions/h: of one fleet; lost: what a mission took beyond a drive from rest to rest without a stop; \
-                 stop: {:.1} s or longer, also before setting out",
+                "missions/h: of one fleet, missions under way at the end do not count; lost: what a mission done took from its \
+                 arrival at the robot beyond a drive from rest to rest without a stop by the vehicle's limits, which the stepped \
+                 tracker exceeds by up to a tick; stop: {:.1} s or longer, also before setting out, per mission begun",
                 f64::from(STOP_SCANS) * SCAN_PERIOD.as_secs_f64()
             ),
+            "a recorded row is like its replay and not like the static rows, whose runs are longer; recorded before these \
+             figures were in the score, it has none"
+                .to_owned(),
             "near misses: two robots under way within a pose spacing of each other without contact, \
              per CS; counted once until they are two spacings apart"
                 .to_owned(),

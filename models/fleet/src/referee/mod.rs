@@ -36,7 +36,8 @@ use hil_core::time::Instant;
 /// From scan to scan.
 pub const SCAN_PERIOD: Duration = Duration::from_millis(30);
 
-/// A robot that stands for so many scans has stopped. The stepped tracker stands between its ticks.
+/// A robot that stands for so many scans has stopped. The stepped tracker stands between its ticks: with ticks of more than
+/// half of this, what is no stop may count as one.
 pub(crate) const STOP_SCANS: u32 = 10;
 
 /// Incidents kept; more are counted.
@@ -116,11 +117,17 @@ impl Referee {
             TruthKind::AuthorityLate => track.is_late = true,
             TruthKind::MissionStarted => self.begin_mission(robot, truth),
             TruthKind::MissionDone => {
-                self.tally.mission_delay_s +=
-                    self.tracks[robot].mission_delay_s(truth, &self.world.vehicle);
+                let delay_s = self.tracks[robot].mission_delay_s(truth, &self.world.vehicle);
+                if let Some(delay_s) = delay_s {
+                    self.tally.missions_timed_count += 1;
+                    self.tally.mission_delay_s += delay_s;
+                }
                 self.end_mission(robot, true);
             }
-            TruthKind::Replaced => self.end_mission(robot, false),
+            TruthKind::Replaced => {
+                self.tracks[robot].begun = None;
+                self.end_mission(robot, false);
+            }
             _ => {}
         }
         self.note_stop_error(robot, truth);
@@ -220,10 +227,10 @@ impl Referee {
         let track = &mut self.tracks[robot];
         track.is_driving = true;
         track.is_late = false;
-        track.begun = MissionStart {
+        track.begun = Some(MissionStart {
+            mission_id: truth.mission_id,
             at: Instant::from_ns(truth.at_ns),
-            way_m: truth.travelled_m,
-        };
+        });
         track.still_count = 0;
         track.cause = Cause::default();
         track.index = track
@@ -358,15 +365,16 @@ pub(crate) struct Track {
     pub(crate) has_moved: bool,
     /// Scans at which it stood still on its mission, one after the other.
     still_count: u32,
-    begun: MissionStart,
+    /// Of the mission it is on; `None` where no record tells.
+    begun: Option<MissionStart>,
     stand: Pose,
 }
 
-/// When a mission began, and where on its path.
+/// When a mission reached its robot.
 #[derive(Debug, Clone, Copy)]
 struct MissionStart {
+    mission_id: u32,
     at: Instant,
-    way_m: f64,
 }
 
 impl Track {
@@ -388,10 +396,7 @@ impl Track {
             position: [stand.x_m, stand.y_m],
             has_moved: true,
             still_count: 0,
-            begun: MissionStart {
-                at: Instant::ZERO,
-                way_m: 0.0,
-            },
+            begun: None,
             stand,
         }
     }
@@ -470,11 +475,15 @@ impl Track {
         self.still_count == STOP_SCANS
     }
 
-    /// How much longer the mission that is `done` took than a drive without a stop, seconds.
-    fn mission_delay_s(&self, done: &Truth, vehicle: &Vehicle) -> f64 {
-        let way_m = (done.travelled_m - self.begun.way_m).max(0.0);
-        let taken_s = Instant::from_ns(done.at_ns).seconds_since(self.begun.at);
-        (taken_s - vehicle.least_time_s(way_m)).max(0.0)
+    /// How much longer the mission that is `done` took than a drive without a stop, seconds; less than 0 where the stepped
+    /// tracker drove faster than the vehicle. `None` where no record tells when it began.
+    fn mission_delay_s(&mut self, done: &Truth, vehicle: &Vehicle) -> Option<f64> {
+        let begun = self
+            .begun
+            .take()
+            .filter(|one| one.mission_id == done.mission_id)?;
+        let taken_s = Instant::from_ns(done.at_ns).seconds_since(begun.at);
+        Some(taken_s - vehicle.least_time_s(done.travelled_m))
     }
 
     /// The ground it covered at the last look.
@@ -531,7 +540,9 @@ hil_core::counts! {
         missions_started_count: u64;
         /// Missions driven to their goal.
         missions_done_count: u64;
-        /// How much longer those took than drives without a stop, all together, seconds.
+        /// Of those, the ones whose beginning was recorded.
+        missions_timed_count: u64;
+        /// How much longer these took than drives without a stop, all together, seconds.
         mission_delay_s: f64;
         /// Times a robot stood still on its mission for [`STOP_SCANS`] scans or longer; before it set out too.
         stops_count: u64;
@@ -563,10 +574,10 @@ fn least(one: Option<f64>, other: Option<f64>) -> Option<f64> {
 }
 
 impl Tally {
-    /// How much longer a mission took than a drive without a stop, seconds; `None` where none was done.
+    /// How much longer a mission took than a drive without a stop, seconds; `None` where none was timed.
     pub(crate) fn mean_mission_delay_s(&self) -> Option<f64> {
-        (self.missions_done_count > 0)
-            .then(|| self.mission_delay_s / self.missions_done_count as f64)
+        (self.missions_timed_count > 0)
+            .then(|| self.mission_delay_s / self.missions_timed_count as f64)
     }
 
     pub(crate) fn count_kind(&mut self, kind: TruthKind) {

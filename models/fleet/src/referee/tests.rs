@@ -152,6 +152,25 @@ fn a_mission_loses_what_it_took_beyond_a_drive_without_a_stop() {
 }
 
 #[test]
+fn a_mission_whose_beginning_was_not_recorded_is_done_and_not_timed() {
+    let scene = scene(Scenario::Crossing);
+    let mut referee = Referee::new(&scene, 1);
+    let mut record = |kind, mission_id, at_ns| {
+        referee.on_truth(&Truth {
+            at_ns,
+            mission_id,
+            ..standing(0, 0, 40.0, kind)
+        });
+        let tally = referee.tally();
+        (tally.missions_done_count, tally.missions_timed_count)
+    };
+    record(TruthKind::MissionStarted, 1, 1_000_000_000);
+    assert_eq!(record(TruthKind::MissionDone, 2, 60_000_000_000), (1, 0));
+    assert_eq!(record(TruthKind::MissionDone, 3, 90_000_000_000), (2, 0));
+    assert_eq!(referee.tally().mean_mission_delay_s(), None);
+}
+
+#[test]
 fn a_replay_of_sorted_records_gives_the_same_tally() {
     let scene = scene(Scenario::Crossing);
     let mut records = Vec::new();

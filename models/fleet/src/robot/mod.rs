@@ -618,6 +618,16 @@ impl RobotParameters {
         }
     }
 
+    /// Longest time that a robot under way stands still because of its tracker.
+    pub(crate) fn longest_tick(&self) -> Duration {
+        match self.tracker {
+            TrackerKind::Exact => Duration::ZERO,
+            TrackerKind::LegacyRk4 => {
+                Duration::from_secs_f64(1e-3 * (self.tracking_period_ms + self.inflation_ms()))
+            }
+        }
+    }
+
     pub(crate) fn tracking_period(&self) -> Duration {
         Duration::from_secs_f64(1e-3 * self.tracking_period_ms)
     }

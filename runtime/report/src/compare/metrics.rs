@@ -436,7 +436,7 @@ struct NetworkFigure {
     metric: &'static str,
     kind: ChartKind,
     unit: &'static str,
-    of: fn(&NetworkMetrics, &ChannelSummary) -> Option<f64>,
+    of: fn(Option<&NetworkMetrics>, &ChannelSummary) -> Option<f64>,
 }
 
 /// Beside loss and delay: order by RFC 4737, copies by RFC 5560, losses in a row by RFC 3357, both forms of delay variation
@@ -446,7 +446,7 @@ const NETWORK: [NetworkFigure; 7] = [
         metric: "reordered",
         kind: ChartKind::Loss,
         unit: "1",
-        of: |figures, _| figures.order.measured().map(|order| order.ratio),
+        of: |figures, _| figures?.order.measured().map(|order| order.ratio),
     },
     NetworkFigure {
         metric: "duplicated",
@@ -454,7 +454,7 @@ const NETWORK: [NetworkFigure; 7] = [
         unit: "1",
         of: |figures, channel| {
             let duplicated_count = channel.account.as_ref()?.duplicated_count?;
-            let share = duplicated_count as f64 / figures.arrived_count as f64;
+            let share = duplicated_count as f64 / figures?.arrived_count as f64;
             share.is_finite().then_some(share)
         },
     },
@@ -465,7 +465,7 @@ const NETWORK: [NetworkFigure; 7] = [
         of: |_, channel| Some(1.0 - service(channel)?.reliability),
     },
     NetworkFigure {
-        metric: "service_down",
+        metric: "unavailability",
         kind: ChartKind::Loss,
         unit: "1",
         of: |_, channel| Some(1.0 - service(channel)?.availability),
@@ -475,7 +475,7 @@ const NETWORK: [NetworkFigure; 7] = [
         kind: ChartKind::Count,
         unit: "messages",
         of: |figures, _| {
-            let runs = figures.loss.measured()?.runs.iter();
+            let runs = figures?.loss.measured()?.runs.iter();
             Some(runs.map(|one| one.length_messages).max().unwrap_or(0) as f64)
         },
     },
@@ -483,13 +483,13 @@ const NETWORK: [NetworkFigure; 7] = [
         metric: "pdv_p99",
         kind: ChartKind::Delay,
         unit: "ns",
-        of: |figures, _| Some(figures.delay.measured()?.variation.p99_ns as f64),
+        of: |figures, _| Some(figures?.delay.measured()?.variation.p99_ns as f64),
     },
     NetworkFigure {
         metric: "ipdv_p99",
         kind: ChartKind::Delay,
         unit: "ns",
-        of: |figures, _| Some(figures.successive.measured()?.p99_ns as f64),
+        of: |figures, _| Some(figures?.successive.measured()?.p99_ns as f64),
     },
 ];
 
@@ -514,7 +514,7 @@ fn network(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedMetric> {
                 let found = runs.iter().filter_map(|run| {
                     let mut channels = run.summary.channels.iter();
                     let found = channels.find(|one| one.name == channel)?;
-                    value(network_of(run, &channel)?, found)
+                    value(network_of(run, &channel), found)
                 });
                 found
                     .map(|value| Estimate {

@@ -78,8 +78,13 @@ impl AnswerFacts {
         let has_interval = intervals.any(|one| matches!(one, Some(Spread::Known(_))));
         let note = if has_interval { "; brackets: 95 %" } else { "" };
         let links = link_words(summary);
+        // Where a link is emulated, that is what was tested.
+        let over = match transports(summary).as_slice() {
+            all if !all.is_empty() && links.is_none() => format!(" over {}", all.join(" and ")),
+            _ => String::new(),
+        };
         rest.extend(links.map(|words| Field::new("emulated link", words)));
-        let words = format!("{}{note}", answer.sample_words());
+        let words = format!("{}{note}", answer.sample_words(&over));
         rest.push(Field::new("sample", words));
         Self {
             measurement: Field::toned("measurement", tone, validity),

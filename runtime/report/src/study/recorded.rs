@@ -80,7 +80,7 @@ impl RunArgument {
         }
     }
 
-    /// The folders that it names, in the order of their names.
+    /// The folders that it names, in the order of their names; a number at the end of a name counts by its value.
     fn folders(&self) -> Result<Vec<PathBuf>, String> {
         let path = Path::new(&self.folder);
         let pattern = path.file_name().and_then(|name| name.to_str());
@@ -101,7 +101,12 @@ impl RunArgument {
             .map(|name| path.with_file_name(name))
             .filter(|path| path.is_dir())
             .collect();
-        folders.sort();
+        folders.sort_by_cached_key(|path| {
+            let name = path.display().to_string();
+            let stem = name.trim_end_matches(|one: char| one.is_ascii_digit());
+            let number = name[stem.len()..].parse::<u64>().ok();
+            (stem.to_owned(), number, name)
+        });
         if folders.is_empty() {
             return Err(format!("{}: no folder is called so", self.folder));
         }
@@ -422,7 +427,7 @@ mod tests {
     #[test]
     fn folders_are_read_by_pattern_and_a_run_given_twice_is_refused() {
         let parent = std::env::temp_dir().join(format!("hil-recorded-{}", std::process::id()));
-        for name in ["wifi-2", "wifi-1", "eth-1"] {
+        for name in ["wifi-10", "wifi-2", "wifi-1", "eth-1"] {
             let folder = parent.join(name);
             fs::create_dir_all(&folder).unwrap();
             let run = run(|_| {});
@@ -445,7 +450,12 @@ mod tests {
         let short = Some(PublishedNetwork::ShortRange);
         assert_eq!(
             named,
-            [("wifi-1", short), ("wifi-2", short), ("/eth-1", None)]
+            [
+                ("wifi-1", short),
+                ("wifi-2", short),
+                ("ifi-10", short),
+                ("/eth-1", None)
+            ]
         );
         assert_eq!(found[0].parameters, json!({ "rate_hz": 125.0 }));
         assert_eq!(found[0].name, "split");

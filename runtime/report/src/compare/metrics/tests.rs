@@ -241,7 +241,7 @@ fn channels_with_a_demand_are_compared_by_what_it_is_judged_by() {
     let figures = network(&runs[0], &runs[1]);
     let down: Vec<_> = figures
         .iter()
-        .filter(|one| one.metric == "service_down")
+        .filter(|one| one.metric == "unavailability")
         .collect();
     let [down] = down.as_slice() else {
         panic!("one channel has a demand: {down:?}");
