@@ -138,8 +138,6 @@ pub(crate) const NEAR_MISSES: Label = label("near_misses_count", "near misses", 
 
 pub(crate) const MISSIONS: Label = label("missions_count", "missions done", "1");
 
-pub(crate) const MISSIONS_PER_HOUR: Label = label("missions_per_hour", "missions per hour", "1");
-
 pub(crate) const MISSIONS_BEGUN: Label = label("missions_begun_count", "missions begun", "1");
 
 pub(crate) const MISSION_DELAY: Label = label("mission_delay_s_mean", "time lost per mission", "s");
@@ -407,7 +405,7 @@ fn work(tally: &Tally, run_s: f64, longest_tick: Duration) -> Vec<Metric> {
             tally.missions_done_count,
             "driven to their goal, all fleets together",
         ),
-        MISSIONS_PER_HOUR.known(
+        label("missions_per_hour", "missions per hour", "1").known(
             per_hour,
             format!("all fleets together, over the whole run of {run_s:.1} s; missions under way do not count"),
         ),
