@@ -4,6 +4,8 @@
 use core::fmt;
 use std::collections::BTreeMap;
 
+use serde::{Deserialize, Serialize};
+
 use crate::interval::Spread;
 use crate::options::Difference;
 use crate::study::StudyRefusal;
@@ -68,7 +70,7 @@ pub struct RecordedLink {
 }
 
 /// So many one-way delays above one and up to another.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DelayBin {
     /// Lower edge, not included.
     pub above_ns: i64,
@@ -79,7 +81,7 @@ pub struct DelayBin {
 }
 
 /// What the network did to a run's messages, on all channels that crossed it together.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RecordedCrossing {
     /// Messages handed to it whose outcome is known.
     pub offered_count: u64,
@@ -192,6 +194,8 @@ pub struct RecordedRun<P> {
     pub parameters: P,
     /// What the network did to its messages.
     pub crossing: RecordedCrossing,
+    /// The same of their datagrams by a passive probe at both hosts, from tap to tap (section II.D); `None` where none was there.
+    pub probed: Option<RecordedCrossing>,
     /// The figures of its score by name.
     pub score: BTreeMap<String, RecordedMetric>,
     /// Scores of the same robots in virtual time over the traces of this run, each with a seed of its own, or why there are
@@ -258,6 +262,7 @@ impl<P> RecordedRun<P> {
             seed: self.seed,
             parameters,
             crossing: self.crossing,
+            probed: self.probed,
             score: self.score,
             replays: self.replays,
             doubts: self.doubts,

@@ -260,6 +260,7 @@ impl<P> RecordedRow<P> {
                 RecordedRun {
                     score: score.clone(),
                     replays: Ok(Vec::new()),
+                    probed: None,
                     crossing: RecordedCrossing {
                         offered_count: 0,
                         lost_count: Err(what()),
@@ -300,38 +301,49 @@ impl<P> RecordedRow<P> {
         name
     }
 
+    fn crossings(&self) -> impl Iterator<Item = &RecordedCrossing> {
+        self.runs.iter().map(|run| &run.crossing)
+    }
+
     /// Share of the messages that the network lost; `None` where that is unavailable of a run.
     pub fn loss_ratio(&self) -> Option<f64> {
-        let (mut lost, mut offered) = (0_u64, 0_u64);
-        for run in &self.runs {
-            lost += run.crossing.lost_count.as_ref().ok()?;
-            offered += run.crossing.offered_count;
-        }
-        (offered > 0).then(|| lost as f64 / offered as f64)
+        loss_ratio(self.crossings())
     }
 
     /// The one-way delay that a `quantile` (0..=1) of all messages did not exceed, milliseconds, within the width of a
     /// bin; `None` where delays are unavailable of a run.
     pub fn delay_ms(&self, quantile: f64) -> Option<f64> {
-        // Channels and runs have the same bins.
-        let mut counts: BTreeMap<(i64, i64), u64> = BTreeMap::new();
-        for run in &self.runs {
-            for bin in run.crossing.delays.as_ref().ok()? {
-                *counts.entry((bin.until_ns, bin.above_ns)).or_default() += bin.count;
-            }
-        }
-        let rank = quantile * counts.values().sum::<u64>() as f64;
-        let mut below = 0.0;
-        for ((until_ns, above_ns), count) in counts.into_iter().filter(|(_, count)| *count > 0) {
-            let count = count as f64;
-            if below + count >= rank {
-                let width_ns = until_ns.saturating_sub(above_ns) as f64;
-                let delay_ns = above_ns as f64 + width_ns * (rank - below) / count;
-                return Some(1e-6 * delay_ns);
-            }
-            below += count;
-        }
-        None
+        delay_ms(self.crossings(), quantile)
+    }
+
+    /// Loss and delay by the passive probe, of the runs that had one; `None` of none.
+    fn probed(&self) -> Option<String> {
+        let probed = self.runs.iter().filter_map(|run| run.probed.as_ref());
+        let count = probed.clone().count();
+        let of = match count {
+            0 => return None,
+            _ if count == self.runs.len() => String::new(),
+            _ => format!(" of {count} of {} runs", self.runs.len()),
+        };
+        let unavailable = |why: Option<&String>| match why {
+            Some(why) => format!("unavailable ({why})"),
+            None => "unavailable".to_owned(),
+        };
+        let mut without = probed
+            .clone()
+            .filter_map(|one| one.lost_count.as_ref().err());
+        let loss = match loss_ratio(probed.clone()) {
+            Some(ratio) => format!("{ratio:.4}"),
+            None => unavailable(without.next()),
+        };
+        let mut without = probed.clone().filter_map(|one| one.delays.as_ref().err());
+        let delays = match [0.5, 0.99].map(|quantile| delay_ms(probed.clone(), quantile)) {
+            [Some(p50), Some(p99)] => format!("p50 {p50:.3} ms, p99 {p99:.3} ms"),
+            _ => unavailable(without.next()),
+        };
+        Some(format!(
+            "by the passive probe{of}: PLR {loss}, delay {delays}"
+        ))
     }
 
     /// How what happened stands to the `published` share.
@@ -367,6 +379,7 @@ impl<P> RecordedRow<P> {
             first.link.about.clone(),
             happened.basis.to_string(),
         ];
+        parts.extend(self.probed());
         if first.network.is_none() {
             parts.push("not comparable: no label says for which network it stands".to_owned());
         }
@@ -401,6 +414,40 @@ impl<P> RecordedRow<P> {
         parts.retain(|part| !part.is_empty());
         format!("{}: {}", self.method(), parts.join("; "))
     }
+}
+
+fn loss_ratio<'a>(crossings: impl Iterator<Item = &'a RecordedCrossing>) -> Option<f64> {
+    let (mut lost, mut offered) = (0_u64, 0_u64);
+    for crossing in crossings {
+        lost += crossing.lost_count.as_ref().ok()?;
+        offered += crossing.offered_count;
+    }
+    (offered > 0).then(|| lost as f64 / offered as f64)
+}
+
+fn delay_ms<'a>(
+    crossings: impl Iterator<Item = &'a RecordedCrossing>,
+    quantile: f64,
+) -> Option<f64> {
+    // Channels and runs have the same bins.
+    let mut counts: BTreeMap<(i64, i64), u64> = BTreeMap::new();
+    for crossing in crossings {
+        for bin in crossing.delays.as_ref().ok()? {
+            *counts.entry((bin.until_ns, bin.above_ns)).or_default() += bin.count;
+        }
+    }
+    let rank = quantile * counts.values().sum::<u64>() as f64;
+    let mut below = 0.0;
+    for ((until_ns, above_ns), count) in counts.into_iter().filter(|(_, count)| *count > 0) {
+        let count = count as f64;
+        if below + count >= rank {
+            let width_ns = until_ns.saturating_sub(above_ns) as f64;
+            let delay_ns = above_ns as f64 + width_ns * (rank - below) / count;
+            return Some(1e-6 * delay_ns);
+        }
+        below += count;
+    }
+    None
 }
 
 /// What a table with recorded rows says of them all.
@@ -474,6 +521,7 @@ mod tests {
                 ]),
             },
             score: BTreeMap::new(),
+            probed: None,
             replays: Ok(Vec::new()),
             doubts: Vec::new(),
         }
@@ -733,6 +781,7 @@ mod tests {
             ..other.clone()
         };
         let without = RecordedRun {
+            probed: None,
             replays: Ok(Vec::new()),
             ..other.clone()
         };
@@ -757,6 +806,42 @@ mod tests {
         assert_eq!((replay.loss_ratio(), replay.delay_ms(0.5)), (None, None));
         let alone = RecordedRow::of_runs(vec![run("c", short, 3)], |_, _| true);
         assert_eq!(alone[0].replayed(), None);
+    }
+
+    #[test]
+    fn what_a_probe_saw_stands_in_the_note_of_the_row_and_not_in_that_of_its_replay() {
+        let short = Some(PublishedNetwork::ShortRange);
+        let runs = ["a", "b"].map(|folder| run(folder, short, 3));
+        let [mut one, mut other] = runs;
+        let none = PooledShare::of(&[], None);
+        let note = |runs: &[&RecordedRun<u32>]| {
+            let runs = runs.iter().map(|run| (*run).clone()).collect();
+            RecordedRow::of_runs(runs, |_, _| true)[0].note(&none)
+        };
+        assert!(!note(&[&one, &other]).contains("probe"));
+        one.probed = Some(one.crossing.clone());
+        let words =
+            "by the passive probe of 1 of 2 runs: PLR 0.0100, delay p50 2.000 ms, p99 3.960 ms";
+        assert!(
+            note(&[&one, &other]).contains(words),
+            "{}",
+            note(&[&one, &other])
+        );
+        other.probed = Some(RecordedCrossing {
+            offered_count: 1000,
+            lost_count: Err("2 malformed".to_owned()),
+            delays: Err("two clocks".to_owned()),
+        });
+        let words =
+            "by the passive probe: PLR unavailable (2 malformed), delay unavailable (two clocks)";
+        assert!(
+            note(&[&one, &other]).contains(words),
+            "{}",
+            note(&[&one, &other])
+        );
+        one.replays = Ok(vec![one.score.clone()]);
+        let replay = RecordedRow::of_runs(vec![one], |_, _| true)[0].replayed();
+        assert_eq!(replay.unwrap().first().probed, None);
     }
 
     #[test]

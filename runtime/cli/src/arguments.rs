@@ -165,6 +165,11 @@ pub struct RunArgs {
     #[arg(long, conflicts_with_all = ["host", "domain_root"])]
     pub on_one_pc: bool,
 
+    /// With --on-one-pc: capture what passes each host's interfaces with the passive probe, to DIR/HOST.pcapng for
+    /// `hil-runtime probe compare`.
+    #[arg(long, value_name = "DIR")]
+    pub probe: Option<PathBuf>,
+
     /// The host among those of --on-one-pc that this process is; not for use by hand.
     #[arg(long, value_name = "NAME", hide = true, conflicts_with_all = ["host", "on_one_pc"])]
     pub on_one_pc_as: Option<String>,

@@ -23,6 +23,7 @@ use hil_teleoperation::swing::swing_bvh;
 use crate::arguments::{Cli, Command, RunArgs};
 use crate::cases;
 use hil_doctor::{Effect, Obstacle, Plan, Trouble, obstacles};
+use hil_engine::process::again::Beside;
 use hil_engine::process::host::{self, HostsError};
 use hil_engine::process::own_program::{self, OwnProgramError};
 use hil_engine::process::worker;
@@ -286,8 +287,14 @@ fn run_topology(
     registry: &Registry,
     console: &mut Console,
 ) -> Result<u8, Refusal> {
-    if let Some(host) = args.on_one_pc_as.take() {
-        args.host = Some(host);
+    let host = args.on_one_pc_as.take();
+    if args.probe.is_some() && host.is_none() && !args.on_one_pc {
+        return Err(usage(
+            "--probe is for --on-one-pc; on a PC of its own a host's wire is captured with `hil-runtime probe`",
+        ));
+    }
+    if let Some(host) = &host {
+        args.host = Some(host.clone());
         args.domain_root = Some(host::DOMAIN_ROOT.into());
         args.overrides
             .push(format!("security.key='{}'", host::KEY_FILE));
@@ -312,7 +319,33 @@ fn run_topology(
     if args.on_one_pc && !args.check {
         return on_one_pc(path, &topology, console);
     }
-    carry_out(path, args, &topology, command_line, registry, console)
+    let folder = args.probe.as_deref().zip(host.as_deref());
+    let probe = folder.map(|(folder, host)| start_probe(&topology, folder, host));
+    let probe = probe.transpose()?;
+    let code = carry_out(path, args, &topology, command_line, registry, console);
+    if let Some(probe) = probe {
+        probe.end(PROBE_ENDS_WITHIN);
+    }
+    code
+}
+
+/// What a probe may take to write what it has.
+const PROBE_ENDS_WITHIN: Duration = Duration::from_secs(10);
+
+/// A passive probe at the interfaces of `host`, which is this process's.
+fn start_probe(topology: &Topology, folder: &Path, host: &str) -> Result<Beside, Refusal> {
+    let cannot = |error| failed(format!("{}: {error}", folder.display()));
+    fs::create_dir_all(folder).map_err(cannot)?;
+    let output = folder.join(format!("{host}.pcapng"));
+    let mut arguments = vec![
+        "probe".to_owned(),
+        "--quiet".to_owned(),
+        "--force".to_owned(),
+    ];
+    arguments.extend(["--output".to_owned(), output.display().to_string()]);
+    let interfaces = host::interfaces(topology, host).into_iter();
+    arguments.extend(interfaces.flat_map(|one| ["--interface".to_owned(), one]));
+    Beside::start(&arguments).map_err(cannot)
 }
 
 /// Runs all hosts of `topology` here, each under a supervisor of its own.

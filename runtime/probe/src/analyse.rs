@@ -661,7 +661,7 @@ fn step_words(step: &ClockStep) -> String {
 }
 
 /// Why loss is unavailable.
-fn doubts_text(doubts: &[CountedDoubt], clocks: PointClocks) -> String {
+pub(super) fn doubts_text(doubts: &[CountedDoubt], clocks: PointClocks) -> String {
     let words = doubts
         .iter()
         .map(|CountedDoubt { doubt, count }| match doubt {

@@ -140,6 +140,10 @@ pub(crate) enum ProbeWork {
         /// Farthest the medians may lie apart, microseconds.
         #[arg(long, value_name = "US", default_value_t = 5.0)]
         limit: f64,
+        /// Keep what the probe saw in the run's folder: the tables' row of the run shows its loss and delay beside the
+        /// account's.
+        #[arg(long)]
+        keep: bool,
         /// How to read them.
         #[command(flatten)]
         reading: ReadingArgs,

@@ -8,17 +8,18 @@ use std::{fs, io};
 
 use hil_account::{AccountContext, ChannelPath, ChannelRecords, MessageFate, each_history};
 use hil_capture::flow::OwnHeader;
-use hil_capture::join::{JoinSettings, Joined};
+use hil_capture::join::{JoinSettings, Joined, Loss};
 use hil_capture::observe::{Observation, Stream};
 use hil_core::record::{EgressRecord, IngressRecord, stamp};
+use hil_core::recorded_run::{DelayBin, RecordedCrossing};
 use hil_net::Direction;
 use hil_protocol::transport::IpProtocol;
 use hil_protocol::wire::Kind;
 use hil_stats::histogram::{Distribution, LatencyHistogram};
 use serde::Serialize;
 
-use super::analyse::Reading;
-use super::point_clocks::WireClocks;
+use super::analyse::{Reading, doubts_text};
+use super::point_clocks::{PointClocks, WireClocks};
 use hil_platform::progress::Stage;
 use hil_present::{Cell, Row, Section, Table, Tone, UNAVAILABLE};
 use hil_report::quantile_table;
@@ -208,6 +209,8 @@ pub(super) struct Comparison {
     run: String,
     clocks: WireClocks,
     channels: Vec<ChannelComparison>,
+    /// What became of the datagrams with messages between the taps, on all channels together.
+    pub(super) crossing: RecordedCrossing,
     /// Channels whose transport has no datagrams of its own that a probe could read.
     left_out: Vec<String>,
 }
@@ -262,6 +265,7 @@ pub(super) fn compare(
         return Err(CompareError::NothingOfRun { capture, run });
     }
     let summary = summary(&folder)?;
+    let clocks = WireClocks::of(summary.as_ref());
     let joined = captures.joined(settings);
     let numbers = channel_numbers(&sides, captures);
     let is_read = |name: &str| {
@@ -270,6 +274,9 @@ pub(super) fn compare(
             .is_none_or(|summary| has_datagrams(summary, name))
     };
     let (compared, left_out): (Vec<_>, Vec<_>) = sides.iter().partition(|(name, _)| is_read(name));
+    let compared_numbers: BTreeSet<u16> = (compared.iter())
+        .filter_map(|(name, _)| numbers.get(*name).copied())
+        .collect();
     let channels = compared.into_iter().map(|(name, side)| {
         let said = summary.as_ref().map(|summary| said(summary, name));
         let probe = Probe {
@@ -282,10 +289,60 @@ pub(super) fn compare(
     Ok(Comparison {
         schema_version: 1,
         run: folder.name(),
-        clocks: WireClocks::of(summary.as_ref()),
+        clocks,
+        crossing: crossing(&joined, &compared_numbers, clocks),
         channels: channels.collect(),
         left_out: left_out.into_iter().map(|(name, _)| name.clone()).collect(),
     })
+}
+
+/// What the probe saw of the datagrams with messages on the channels of these numbers.
+fn crossing(
+    joined: &[(Stream, Joined)],
+    numbers: &BTreeSet<u16>,
+    clocks: WireClocks,
+) -> RecordedCrossing {
+    let mut sum = RecordedCrossing {
+        offered_count: 0,
+        lost_count: Ok(0),
+        delays: Ok(Vec::new()),
+    };
+    let mut histogram = LatencyHistogram::default();
+    let is_data = |stream: &Stream| {
+        let own = stream.own;
+        own.is_some_and(|(number, kind)| kind == Kind::Data as u8 && numbers.contains(&number))
+    };
+    for (_, joined) in joined.iter().filter(|(stream, _)| is_data(stream)) {
+        let figures = &joined.figures;
+        sum.offered_count += figures.matched_count;
+        match (&figures.loss, &mut sum.lost_count) {
+            (Loss::Counted(loss), Ok(count)) => {
+                *count += loss.count;
+                sum.offered_count += loss.count;
+            }
+            (Loss::Counted(_), Err(_)) => {}
+            (Loss::Unavailable { doubts, .. }, lost) => {
+                *lost = Err(doubts_text(doubts, PointClocks::Unknown));
+            }
+        }
+        if figures.delay.measured().is_none() && figures.matched_count > 0 {
+            sum.delays = Err("a clock was set".to_owned());
+        }
+        for pair in joined.pairs.iter().filter(|pair| pair.is_stamped()) {
+            histogram.record(pair.second.stamp_ns.saturating_sub(pair.first.stamp_ns));
+        }
+    }
+    if clocks != WireClocks::One {
+        sum.delays = Err(clocks.words().to_owned());
+    }
+    if let Ok(delays) = &mut sum.delays {
+        delays.extend(histogram.bins().iter().map(|bin| DelayBin {
+            above_ns: bin.from_ns(),
+            until_ns: bin.until_ns,
+            count: bin.count,
+        }));
+    }
+    sum
 }
 
 /// Whether a channel's gateways send datagrams that stand on the wire as they made them.

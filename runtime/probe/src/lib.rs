@@ -31,6 +31,7 @@ use hil_platform::text::grouped;
 use hil_present::terminal::canvas::Style;
 use hil_present::terminal::render;
 use hil_present::{Section, Tone};
+use hil_report::study::probed;
 
 /// Exit codes; the command's help lists them.
 mod exit {
@@ -64,6 +65,7 @@ pub fn run(args: &ProbeArgs, columns: usize, console: &mut Console) -> u8 {
             file,
             second,
             limit,
+            keep,
             reading,
         }) => {
             let paths = paths(file, second.as_deref());
@@ -84,6 +86,11 @@ pub fn run(args: &ProbeArgs, columns: usize, console: &mut Console) -> u8 {
                     } else {
                         text(&comparison.sections(*limit))
                     });
+                    if *keep && let Err(error) = probed::write(run, &comparison.crossing) {
+                        let path = run.join(probed::FILE);
+                        console.error(&format!("{}: {error}", path.display()));
+                        return exit::INTERNAL;
+                    }
                     if comparison.agrees_within(*limit) && !captures.has_gaps() {
                         exit::DONE
                     } else {

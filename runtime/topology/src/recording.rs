@@ -51,6 +51,8 @@ options! {
         enough: Option<u64>, in 1..=i64::MAX.unsigned_abs();
         /// Seed of the first run; each further run has the next one.
         seed: u64 = 1, in 0..=u64::from(u32::MAX);
+        /// Whether a passive probe captures at both hosts of a run on one PC, for loss and delay beside the account's.
+        probe: bool = false;
     }
     check RecordingRow::check_set;
 }

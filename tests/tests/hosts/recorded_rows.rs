@@ -25,16 +25,20 @@ const LOOPS: &str = "case.parameters.tables.loops=20";
 /// A loop every second, so that a short run has some.
 const PERIOD: &str = "case.parameters.motion_period_s=1.0";
 
-/// A folder that the user may write to, with a recording of a few motion loops in it.
-fn recording() -> RunFolder {
+/// An emulated link of a row, and a real one whose wire a probe sees.
+const EMULATED: &str =
+    "network = \"short\"\nset = [\"links.hop.via=emulated\", \"links.hop.delay=1 ms\", ";
+const PROBED: &str = "network = \"ethernet\"\nprobe = true\nset = [";
+
+/// A folder that the user may write to, with a recording of a few motion loops over `link` in it.
+fn recording(link: &str) -> RunFolder {
     let folder = RunFolder::new("recorded-rows");
     fs::set_permissions(folder.path(), Permissions::from_mode(0o777)).unwrap();
     let [split, tables] = ["split.toml", "teleop-tables.toml"]
         .map(|name| shipped_topology(name).display().to_string());
     let text = format!(
         "folder = \"runs\"\ntables = \"{tables}\"\nset = ['{TABLES}', '{LOOPS}', '{PERIOD}']\n[rows.short]\n\
-         network = \"short\"\ntopology = \"{split}\"\nenough = 5\nseed = 3\n\
-         set = [\"run.duration=5 s\", '{PERIOD}', \"links.hop.via=emulated\", \"links.hop.delay=1 ms\"]\n"
+         topology = \"{split}\"\nenough = 5\nseed = 3\n{link}\"run.duration=5 s\", '{PERIOD}']\n"
     );
     folder.write("rows.toml", &text);
     folder
@@ -87,7 +91,7 @@ fn tables_of(finished: &Finished) -> Value {
 
 #[test]
 fn rows_that_were_ended_and_killed_become_those_of_their_runs() {
-    let folder = recording();
+    let folder = recording(EMULATED);
     let row = folder.join("runs/short");
     let mut call = record(&folder);
     wait_until(LIMIT, "a run under way", || is_under_way(&row));
@@ -159,4 +163,39 @@ fn rows_that_were_ended_and_killed_become_those_of_their_runs() {
     wait_until(LIMIT, "the end of all processes", || {
         processes_mentioning(&folder.path().to_string_lossy()).is_empty()
     });
+}
+
+#[test]
+fn a_probed_row_has_loss_and_delay_of_the_wire_beside_those_of_the_account() {
+    let folder = recording(PROBED);
+    let row = folder.join("runs/short");
+    let mut calls = (0..CALLS_MAX).map(|_| record(&folder).wait_within(LIMIT).unwrap());
+    let recorded = calls
+        .find(|one| one.status.success())
+        .expect("the host keeps up now and then");
+    let notes = tables_of(&recorded)[0]["notes"].to_string();
+    let probe = "by the passive probe: PLR 0.0000, delay p50 0.";
+    assert!(notes.contains(probe), "{notes}");
+    for run in sound_runs(&row) {
+        let entries = fs::read_dir(row.join(run)).unwrap().flatten();
+        let mut names: Vec<_> = entries.map(|entry| entry.file_name()).collect();
+        names.sort();
+        let kept = [
+            "manifest.json",
+            "probe.json",
+            "replays",
+            "report.txt",
+            "summary.json",
+        ];
+        assert_eq!(names, kept);
+    }
+    assert!(!row.join("under-way").exists());
+    // What an emulated link does, it does before the wire.
+    let text = fs::read_to_string(folder.join("rows.toml")).unwrap();
+    let emulated = "set = [\"links.hop.via=emulated\", \"links.hop.delay=1 ms\", \"run";
+    folder.write("rows.toml", &text.replace("set = [\"run", emulated));
+    let refused = record(&folder).wait_within(LIMIT).unwrap();
+    refused.assert_code(2);
+    let expected = "rows.short: probe = true, and a link is emulated";
+    assert!(refused.stderr.contains(expected), "{}", refused.stderr);
 }

@@ -188,6 +188,7 @@ mod tests {
                 }]),
             },
             score: score.collect(),
+            probed: None,
             replays: Ok(Vec::new()),
             doubts: Vec::new(),
         }

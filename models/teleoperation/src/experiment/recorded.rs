@@ -228,6 +228,7 @@ mod tests {
             score: score
                 .map(|(label, metric)| (label.name.to_owned(), metric))
                 .into(),
+            probed: None,
             replays: Ok(Vec::new()),
             doubts: Vec::new(),
         }

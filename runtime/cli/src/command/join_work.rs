@@ -49,6 +49,7 @@ pub(super) fn join(
         host: None,
         on_one_pc: false,
         on_one_pc_as: None,
+        probe: None,
         overrides: Vec::new(),
         check: false,
         quiet: args.quiet,

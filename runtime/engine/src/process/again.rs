@@ -1,15 +1,17 @@
-//! This program once more as a child that cannot outlive it: a run among others of which this process keeps account.
+//! This program once more as a child that cannot outlive it: a run among others of which this process keeps account, or a
+//! probe beside a run.
 
 use std::fs::File;
 use std::os::unix::process::CommandExt as _;
 use std::path::PathBuf;
-use std::process::Stdio;
-use std::time::Duration;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
 use std::{env, io, process, thread};
 
 use hil_platform::own_process::{self, RUNNING_FILE};
 use hil_platform::signals::Signals;
 use hil_platform::systemd;
+use nix::sys::signal::Signal;
 
 use crate::supervisor::Child;
 
@@ -28,18 +30,9 @@ pub fn run_again(
     signals: &Signals,
     mut meanwhile: impl FnMut(),
 ) -> io::Result<Option<i32>> {
-    // As its user would start it, unless another file is there by now.
-    let called = env::current_exe().ok().filter(|path| path.is_file());
-    let program = called.unwrap_or_else(|| PathBuf::from(RUNNING_FILE));
-    let mut command = own_process::again();
-    command.args(["become", "--supervisor", &process::id().to_string()]);
-    command.arg("--").arg(program).args(arguments);
-    command.stdin(Stdio::null()).stdout(output.try_clone()?);
-    // Told by this process when to end, and once.
-    command.stderr(output.try_clone()?).process_group(0);
-    for variable in systemd::VARIABLES {
-        command.env_remove(variable);
-    }
+    let mut command = command(arguments);
+    command.stdout(output.try_clone()?);
+    command.stderr(output.try_clone()?);
     let mut child = Child::spawn_apart(&mut command)?;
     let mut is_told = false;
     loop {
@@ -52,5 +45,43 @@ pub fn run_again(
         }
         meanwhile();
         thread::sleep(LOOK_PERIOD);
+    }
+}
+
+/// This program with `arguments`, bound to this process.
+fn command(arguments: &[String]) -> Command {
+    // As its user would start it, unless another file is there by now.
+    let called = env::current_exe().ok().filter(|path| path.is_file());
+    let program = called.unwrap_or_else(|| PathBuf::from(RUNNING_FILE));
+    let mut command = own_process::again();
+    command.args(["become", "--supervisor", &process::id().to_string()]);
+    command.arg("--").arg(program).args(arguments);
+    // Told by this process when to end, and once.
+    command.stdin(Stdio::null()).process_group(0);
+    for variable in systemd::VARIABLES {
+        command.env_remove(variable);
+    }
+    command
+}
+
+/// This program once more beside this process.
+#[derive(Debug)]
+pub struct Beside(Child);
+
+impl Beside {
+    /// Starts it with `arguments`; only what it says of faults is heard.
+    ///
+    /// # Errors
+    /// When it cannot be started.
+    pub fn start(arguments: &[String]) -> io::Result<Self> {
+        let mut command = command(arguments);
+        command.stdout(Stdio::null());
+        Child::spawn_apart(&mut command).map(Self)
+    }
+
+    /// Tells it to end, and kills it where it has not `within` that time.
+    pub fn end(mut self, within: Duration) {
+        self.0.signal(Signal::SIGTERM);
+        self.0.end(Instant::now() + within);
     }
 }

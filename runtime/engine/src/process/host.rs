@@ -123,6 +123,17 @@ pub fn check(topology: &Topology) -> Result<(), HostsError> {
     wires(topology.hosts()).map(drop)
 }
 
+/// The interfaces of the host called `name`, on one PC.
+pub fn interfaces(topology: &Topology, name: &str) -> Vec<String> {
+    let hosts = topology.hosts();
+    let ends = wires(hosts)
+        .into_iter()
+        .flatten()
+        .flat_map(|wire| wire.ends);
+    let own = ends.filter(|end| hosts[end.host].name == name);
+    own.map(|end| end.interface).collect()
+}
+
 /// Runs all hosts of `topology`, each by the arguments of this process, and gives the exit code of the first one
 /// that did not end with 0. The first host has this process's outputs; of others the warnings and errors are
 /// said, each with the host's name. This process must have one thread.

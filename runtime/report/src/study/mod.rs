@@ -3,6 +3,7 @@
 //! tasks alone, whatever the number of threads.
 
 mod pool;
+pub mod probed;
 mod recorded;
 pub mod recording;
 mod sections;

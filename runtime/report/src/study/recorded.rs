@@ -18,6 +18,7 @@ use crate::answer::{Answer, is_score_incomplete};
 use crate::assessment::Assessment;
 use crate::compare::ComparedRun;
 use crate::link_change::LinkChange;
+use crate::study::probed;
 use crate::study::recording::trace_replay;
 use crate::summary::{
     ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RunSummary, ScoreMetric,
@@ -216,6 +217,7 @@ pub(super) fn recorded(
     let replays = trace_replay::read(&folder)
         .map_err(|error| error.to_string())?
         .map(|scores| scores.iter().map(|score| by_name(score)).collect());
+    let probed = probed::read(&folder).map_err(|error| format!("{}: {error}", probed::FILE))?;
     Ok(RecordedRun {
         folder: folder.display().to_string(),
         name: match topology.get("name").and_then(Value::as_str) {
@@ -228,6 +230,7 @@ pub(super) fn recorded(
         seed: facts.seed,
         parameters,
         crossing: crossing_of(&summary, &crossing),
+        probed,
         score: by_name(&summary.score),
         replays,
         doubts: doubts(&summary),

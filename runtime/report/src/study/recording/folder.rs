@@ -9,16 +9,20 @@ use std::path::{Path, PathBuf};
 use hil_rundir::run_folder::RunFolder;
 
 use super::trace_replay;
+use crate::study::probed;
 
 /// What a kept run needs for tables, reports and comparisons.
-const KEPT: [&str; 4] = [
+const KEPT: [&str; 5] = [
     "manifest.json",
     "summary.json",
     "report.txt",
     trace_replay::FOLDER,
+    probed::FILE,
 ];
 /// What is large in the folder of a run.
 const LARGE: [&str; 3] = ["records", "traces", "series"];
+/// Beside the hosts' folders of the run under way: what a passive probe captured.
+const CAPTURES: &str = "captures";
 /// Why a run was refused.
 const CAUSE: &str = "cause.txt";
 /// What a refused run said.
@@ -75,6 +79,11 @@ impl RowFolder {
     /// Where a run under way is recorded.
     pub(super) fn under_way(&self) -> PathBuf {
         self.root.join("under-way")
+    }
+
+    /// Where a passive probe captures meanwhile.
+    pub(super) fn captures(&self) -> PathBuf {
+        self.under_way().join(CAPTURES)
     }
 
     pub(super) fn path(&self, part: Part) -> PathBuf {
@@ -144,6 +153,7 @@ impl RowFolder {
     /// Keeps what is there of the run under way as `part`, which was refused because of `cause`; `said` is what it said.
     pub(super) fn put_aside(&self, part: Part, cause: &str, said: &str) -> io::Result<()> {
         let under_way = self.under_way();
+        removed(&self.captures())?;
         for folder in folders_in(&under_way)? {
             LARGE
                 .iter()

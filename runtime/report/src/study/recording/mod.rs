@@ -26,6 +26,7 @@ use serde_json::Value;
 use self::folder::{Part, RowFolder};
 use self::next::{Found, Next, REFUSED_MAX, Target, next};
 use super::RunArgument;
+use super::probed;
 use super::recorded::recorded;
 use crate::compare::{ComparedRun, add_leaves};
 use crate::summary::Outcome;
@@ -121,6 +122,8 @@ struct Row<'a> {
     sample: RowSample,
     target: Target,
     case: &'static str,
+    /// A passive probe captures at these hosts; nowhere if there are none.
+    probed: Vec<String>,
     folder: RowFolder,
 }
 
@@ -331,6 +334,7 @@ fn rows<'a>(
     recording: &'a Recording,
     tables: &Topology,
     registry: &Registry,
+    host: Option<&str>,
 ) -> Result<Vec<Row<'a>>, RecordingError> {
     let wanted = tables.case().map_or("none", |case| case.name.as_str());
     let entry = registry.find(wanted);
@@ -359,6 +363,11 @@ fn rows<'a>(
         let is_tried = sample
             .copies
             .is_some_and(|key| !row.sets(&format!("{PARAMETERS}{key}")));
+        let probed = match row.probe {
+            true => probed_hosts(&topology, host)
+                .map_err(|why| refused(format!("probe = true, and {why}")))?,
+            false => Vec::new(),
+        };
         Ok(Row {
             name,
             network: row.network,
@@ -372,10 +381,28 @@ fn rows<'a>(
                 is_tried,
             },
             case,
+            probed,
             folder: RowFolder::new(root.join(name)),
         })
     });
     rows.collect()
+}
+
+/// The hosts at which a probe captures; else why its figures would not be the network's.
+fn probed_hosts(topology: &Topology, host: Option<&str>) -> Result<Vec<String>, &'static str> {
+    let mut links = topology.links().iter();
+    if host.is_some() {
+        return Err("--host is given: start `hil-runtime probe` beside each host's run");
+    }
+    if links.any(|link| link.emulation().is_some()) {
+        return Err(
+            "a link is emulated: its gateways keep what it delays and drop what it loses before the wire",
+        );
+    }
+    match topology.hosts() {
+        [one, other] => Ok(vec![one.name.clone(), other.name.clone()]),
+        _ => Err("its topology has not two hosts"),
+    }
 }
 
 /// Records what the rows of `recording` lack, with all hosts on this PC, or as this `host` beside others. A run that was under way
@@ -392,7 +419,7 @@ pub fn record(
     signals: &Signals,
     console: &mut Console,
 ) -> Result<Recorded, RecordingError> {
-    let rows = rows(recording, tables, registry)?;
+    let rows = rows(recording, tables, registry, host)?;
     let said = lock(Path::new(&recording.folder), signals, console)?;
     // Before the first run: a fault of the last row would be told after hours.
     let found = rows.iter().map(Row::found).collect::<Result<Vec<_>, _>>()?;
@@ -602,6 +629,10 @@ impl RunMaker<'_> {
             None => vec!["--on-one-pc".to_owned()],
             Some(name) => vec!["--host".to_owned(), name.to_owned()],
         });
+        if !row.probed.is_empty() {
+            let captures = row.folder.captures().display().to_string();
+            arguments.extend(["--probe".to_owned(), captures]);
+        }
         arguments.extend(
             overrides
                 .into_iter()
@@ -622,6 +653,9 @@ impl RunMaker<'_> {
                 _ => Made::Hopeless(why),
             });
         }
+        if let Some(folder) = folder.as_ref().filter(|_| !row.probed.is_empty()) {
+            self.compare_probe(row, folder).map_err(failed)?;
+        }
         let mut ended_elsewhere = None;
         let outcome = folder
             .ok_or_else(|| self.said.last_line())
@@ -631,6 +665,10 @@ impl RunMaker<'_> {
                 ended_elsewhere =
                     (facts.outcome == Outcome::Stopped).then(|| facts.exit_reason.clone());
                 let count = row.judge(run, part)?;
+                if !row.probed.is_empty() && !folder.join(probed::FILE).is_file() {
+                    let why = self.said.last_line();
+                    return Err(format!("its probe's captures tell nothing: {why}"));
+                }
                 Ok(Made::Sound { folder, count })
             });
         if let (Ok(Made::Sound { folder, .. }), Part::Run(_)) = (&outcome, part) {
@@ -645,6 +683,24 @@ impl RunMaker<'_> {
             // As the call on the host that ended it, this one makes it again: all hosts make the same runs.
             Err(why) => ended_elsewhere.map_or(Made::Refused(why), Made::Hopeless),
         })
+    }
+}
+
+impl RunMaker<'_> {
+    /// Keeps what the probe saw of the run in `folder`.
+    fn compare_probe(&mut self, row: &Row<'_>, folder: &Path) -> io::Result<()> {
+        let mut arguments = vec![
+            "probe".to_owned(),
+            "compare".to_owned(),
+            "--keep".to_owned(),
+        ];
+        arguments.push(folder.display().to_string());
+        let captures = row.probed.iter();
+        arguments.extend(captures.map(|host| {
+            let file = row.folder.captures().join(format!("{host}.pcapng"));
+            file.display().to_string()
+        }));
+        (self.start)(&arguments, &self.said.file, &mut || {}).map(drop)
     }
 }
 
@@ -737,6 +793,7 @@ mod tests {
                 }]),
             },
             score: BTreeMap::new(),
+            probed: None,
             replays: Ok(Vec::new()),
             doubts: Vec::new(),
         };
