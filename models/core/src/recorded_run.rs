@@ -83,12 +83,21 @@ pub struct DelayBin {
 /// What the network did to a run's messages, on all channels that crossed it together.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RecordedCrossing {
-    /// Messages handed to it whose outcome is known.
+    /// Messages, or datagrams, handed to it whose outcome is known.
     pub offered_count: u64,
     /// Of these, lost by it; else why that is unavailable.
     pub lost_count: Result<u64, String>,
     /// Their delays, from one host's kernel to the other's gateway, in any order; else why there are none.
     pub delays: Result<Vec<DelayBin>, String>,
+}
+
+/// What a passive probe at both hosts saw of a run's messages, from tap to tap (section II.D).
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ProbedCrossing {
+    /// Of their datagrams.
+    pub crossing: RecordedCrossing,
+    /// Channels of which it sees no datagrams, since they go over TCP.
+    pub left_out: Vec<String>,
 }
 
 /// A figure of a run's score.
@@ -194,8 +203,8 @@ pub struct RecordedRun<P> {
     pub parameters: P,
     /// What the network did to its messages.
     pub crossing: RecordedCrossing,
-    /// The same of their datagrams by a passive probe at both hosts, from tap to tap (section II.D); `None` where none was there.
-    pub probed: Option<RecordedCrossing>,
+    /// The same by a passive probe; `None` where none was there.
+    pub probed: Option<ProbedCrossing>,
     /// The figures of its score by name.
     pub score: BTreeMap<String, RecordedMetric>,
     /// Scores of the same robots in virtual time over the traces of this run, each with a seed of its own, or why there are

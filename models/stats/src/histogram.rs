@@ -2,6 +2,7 @@
 //! or unaligned clocks produce, are kept and counted apart, never clipped to zero.
 
 use hdrhistogram::Histogram;
+use hil_core::recorded_run::DelayBin;
 use serde::{Deserialize, Serialize};
 
 use crate::samples::Samples;
@@ -178,6 +179,16 @@ pub struct DurationBin {
     pub until_ns: i64,
     /// Values in it.
     pub count: u64,
+}
+
+impl From<DurationBin> for DelayBin {
+    fn from(bin: DurationBin) -> Self {
+        Self {
+            above_ns: bin.from_ns(),
+            until_ns: bin.until_ns,
+            count: bin.count,
+        }
+    }
 }
 
 impl DurationBin {

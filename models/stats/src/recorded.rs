@@ -2,7 +2,7 @@
 //! network, and how a row stands to the published one. It knows no case.
 
 use core::fmt;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use hil_core::interval::{Interval, Spread, TooSmall};
 use hil_core::recorded_run::{Doubt, LinkOrigin, RecordedCrossing, RecordedRun};
@@ -319,30 +319,38 @@ impl<P> RecordedRow<P> {
     /// Loss and delay by the passive probe, of the runs that had one; `None` of none.
     fn probed(&self) -> Option<String> {
         let probed = self.runs.iter().filter_map(|run| run.probed.as_ref());
-        let count = probed.clone().count();
-        let of = match count {
+        let of = match probed.clone().count() {
             0 => return None,
-            _ if count == self.runs.len() => String::new(),
-            _ => format!(" of {count} of {} runs", self.runs.len()),
+            count if count == self.runs.len() => String::new(),
+            count => format!(" of {count} of {} runs", self.runs.len()),
         };
+        let crossings = probed.clone().map(|one| &one.crossing);
         let unavailable = |why: Option<&String>| match why {
             Some(why) => format!("unavailable ({why})"),
             None => "unavailable".to_owned(),
         };
-        let mut without = probed
-            .clone()
-            .filter_map(|one| one.lost_count.as_ref().err());
-        let loss = match loss_ratio(probed.clone()) {
+        let mut without = (crossings.clone()).filter_map(|one| one.lost_count.as_ref().err());
+        let loss = match loss_ratio(crossings.clone()) {
             Some(ratio) => format!("{ratio:.4}"),
             None => unavailable(without.next()),
         };
-        let mut without = probed.clone().filter_map(|one| one.delays.as_ref().err());
-        let delays = match [0.5, 0.99].map(|quantile| delay_ms(probed.clone(), quantile)) {
+        let mut without = (crossings.clone()).filter_map(|one| one.delays.as_ref().err());
+        let delays = match [0.5, 0.99].map(|quantile| delay_ms(crossings.clone(), quantile)) {
             [Some(p50), Some(p99)] => format!("p50 {p50:.3} ms, p99 {p99:.3} ms"),
             _ => unavailable(without.next()),
         };
+        let left_out: BTreeSet<&str> = (probed.flat_map(|one| &one.left_out))
+            .map(String::as_str)
+            .collect();
+        let without = match left_out.is_empty() {
+            true => String::new(),
+            false => {
+                let names: Vec<_> = left_out.into_iter().collect();
+                format!(", without {} (TCP)", names.join(" and "))
+            }
+        };
         Some(format!(
-            "by the passive probe{of}: PLR {loss}, delay {delays}"
+            "datagrams by the passive probe{of}: PLR {loss}, delay {delays}{without}"
         ))
     }
 
@@ -485,7 +493,7 @@ mod tests {
     use hil_core::interval::IntervalMethod;
     use hil_core::random::RandomStream;
     use hil_core::recorded_run::{
-        DelayBin, PublishedNetwork, RecordedCrossing, RecordedLink, RecordedMetric,
+        DelayBin, ProbedCrossing, PublishedNetwork, RecordedCrossing, RecordedLink, RecordedMetric,
     };
 
     const fn share(count: u64, of: u64) -> Share {
@@ -811,29 +819,34 @@ mod tests {
     #[test]
     fn what_a_probe_saw_stands_in_the_note_of_the_row_and_not_in_that_of_its_replay() {
         let short = Some(PublishedNetwork::ShortRange);
-        let runs = ["a", "b"].map(|folder| run(folder, short, 3));
-        let [mut one, mut other] = runs;
+        let [mut one, mut other] =
+            [("a", 3), ("b", 4)].map(|(folder, seed)| run(folder, short, seed));
         let none = PooledShare::of(&[], None);
-        let note = |runs: &[&RecordedRun<u32>]| {
+        let note = |runs: &[&RecordedRun<u8>]| {
             let runs = runs.iter().map(|run| (*run).clone()).collect();
             RecordedRow::of_runs(runs, |_, _| true)[0].note(&none)
         };
         assert!(!note(&[&one, &other]).contains("probe"));
-        one.probed = Some(one.crossing.clone());
-        let words =
-            "by the passive probe of 1 of 2 runs: PLR 0.0100, delay p50 2.000 ms, p99 3.960 ms";
+        one.probed = Some(ProbedCrossing {
+            crossing: one.crossing.clone(),
+            left_out: vec!["b".to_owned(), "a".to_owned()],
+        });
+        let words = "datagrams by the passive probe of 1 of 2 runs: PLR 0.0100, delay p50 2.000 ms, p99 3.960 ms, \
+                     without a and b (TCP)";
         assert!(
             note(&[&one, &other]).contains(words),
             "{}",
             note(&[&one, &other])
         );
-        other.probed = Some(RecordedCrossing {
-            offered_count: 1000,
-            lost_count: Err("2 malformed".to_owned()),
-            delays: Err("two clocks".to_owned()),
+        other.probed = Some(ProbedCrossing {
+            crossing: RecordedCrossing {
+                offered_count: 1000,
+                lost_count: Err("2 malformed".to_owned()),
+                delays: Err("two clocks".to_owned()),
+            },
+            left_out: Vec::new(),
         });
-        let words =
-            "by the passive probe: PLR unavailable (2 malformed), delay unavailable (two clocks)";
+        let words = "by the passive probe: PLR unavailable (2 malformed), delay unavailable (two clocks), without";
         assert!(
             note(&[&one, &other]).contains(words),
             "{}",

@@ -287,14 +287,13 @@ fn run_topology(
     registry: &Registry,
     console: &mut Console,
 ) -> Result<u8, Refusal> {
-    let host = args.on_one_pc_as.take();
-    if args.probe.is_some() && host.is_none() && !args.on_one_pc {
+    if args.probe.is_some() && args.on_one_pc_as.is_none() && !args.on_one_pc {
         return Err(usage(
             "--probe is for --on-one-pc; on a PC of its own a host's wire is captured with `hil-runtime probe`",
         ));
     }
-    if let Some(host) = &host {
-        args.host = Some(host.clone());
+    if let Some(host) = args.on_one_pc_as.take() {
+        args.host = Some(host);
         args.domain_root = Some(host::DOMAIN_ROOT.into());
         args.overrides
             .push(format!("security.key='{}'", host::KEY_FILE));
@@ -319,33 +318,43 @@ fn run_topology(
     if args.on_one_pc && !args.check {
         return on_one_pc(path, &topology, console);
     }
-    let folder = args.probe.as_deref().zip(host.as_deref());
-    let probe = folder.map(|(folder, host)| start_probe(&topology, folder, host));
-    let probe = probe.transpose()?;
-    let code = carry_out(path, args, &topology, command_line, registry, console);
-    if let Some(probe) = probe {
-        probe.end(PROBE_ENDS_WITHIN);
-    }
-    code
+    carry_out(path, args, &topology, command_line, registry, console)
 }
 
-/// What a probe may take to write what it has.
+/// How long a probe may take to begin, and to write what it has.
+const PROBE_BEGINS_WITHIN: Duration = Duration::from_secs(5);
 const PROBE_ENDS_WITHIN: Duration = Duration::from_secs(10);
+const PROBE_PERIOD: Duration = Duration::from_millis(10);
 
-/// A passive probe at the interfaces of `host`, which is this process's.
+/// A passive probe at the interfaces of `host`, one of those on one PC, that captures to a file in `folder`.
 fn start_probe(topology: &Topology, folder: &Path, host: &str) -> Result<Beside, Refusal> {
-    let cannot = |error| failed(format!("{}: {error}", folder.display()));
-    fs::create_dir_all(folder).map_err(cannot)?;
     let output = folder.join(format!("{host}.pcapng"));
-    let mut arguments = vec![
-        "probe".to_owned(),
-        "--quiet".to_owned(),
-        "--force".to_owned(),
-    ];
-    arguments.extend(["--output".to_owned(), output.display().to_string()]);
-    let interfaces = host::interfaces(topology, host).into_iter();
-    arguments.extend(interfaces.flat_map(|one| ["--interface".to_owned(), one]));
-    Beside::start(&arguments).map_err(cannot)
+    let cannot = |error: io::Error| failed(format!("{}: {error}", output.display()));
+    fs::create_dir_all(folder).map_err(cannot)?;
+    if output.exists() {
+        let output = output.display();
+        return Err(usage(format!(
+            "{output}: exists; give --probe another folder"
+        )));
+    }
+    let mut arguments = ["probe", "--quiet", "--output"].map(str::to_owned).to_vec();
+    arguments.push(output.display().to_string());
+    let interfaces = host::interfaces(topology, host).map_err(failed)?;
+    arguments.extend((interfaces.into_iter()).flat_map(|one| ["--interface".to_owned(), one]));
+    let mut probe = host::start_probe(&arguments).map_err(cannot)?;
+    // Its file has a head once it captures.
+    let deadline = Instant::now() + PROBE_BEGINS_WITHIN;
+    while fs::metadata(&output).map_or(0, |file| file.len()) == 0 {
+        if probe.is_over() || Instant::now() >= deadline {
+            let code = probe
+                .end(Duration::ZERO)
+                .and_then(|code| u8::try_from(code).ok());
+            let text = format!("the probe of {host} does not capture, so that nothing is run");
+            return Err(Refusal::new(code.unwrap_or(exit::FAILED), text));
+        }
+        thread::sleep(PROBE_PERIOD);
+    }
+    Ok(probe)
 }
 
 /// Runs all hosts of `topology` here, each under a supervisor of its own.
@@ -395,11 +404,20 @@ fn carry_out(
         command_line,
         layouts: layouts(topology, registry),
     };
+    let folder = args.probe.as_deref().zip(options.hosts.first());
+    let probe = folder.map(|(folder, host)| start_probe(topology, folder, host));
+    let probe = probe.transpose()?;
     console.serve();
-    let result = supervisor::run(topology, &options, claims, &signals, console)
-        .map_err(|error| Refusal::new(exit_code_of_error(&error), error))?;
+    let result = supervisor::run(topology, &options, claims, &signals, console);
+    // Before the other host's interface goes with its last process.
+    let probed = probe.map(|probe| probe.end(PROBE_ENDS_WITHIN));
+    let result = result.map_err(|error| Refusal::new(exit_code_of_error(&error), error))?;
+    let has_no_capture = probed.is_some_and(|code| code != Some(0));
+    if has_no_capture {
+        console.warn("the probe's capture is not whole");
+    }
     let code = match exit_code(&result.outcome) {
-        exit::RAN if result.has_gaps() => exit::FAILED,
+        exit::RAN if result.has_gaps() || has_no_capture => exit::FAILED,
         code => code,
     };
     let concluded = Progress::begin().during(console, "drawing up the account", |_| {

@@ -8,10 +8,10 @@ use std::{fs, io};
 
 use hil_account::{AccountContext, ChannelPath, ChannelRecords, MessageFate, each_history};
 use hil_capture::flow::OwnHeader;
-use hil_capture::join::{JoinSettings, Joined, Loss};
+use hil_capture::join::{JoinSettings, Joined, Loss, Pair};
 use hil_capture::observe::{Observation, Stream};
 use hil_core::record::{EgressRecord, IngressRecord, stamp};
-use hil_core::recorded_run::{DelayBin, RecordedCrossing};
+use hil_core::recorded_run::{DelayBin, ProbedCrossing, RecordedCrossing};
 use hil_net::Direction;
 use hil_protocol::transport::IpProtocol;
 use hil_protocol::wire::Kind;
@@ -210,7 +210,8 @@ pub(super) struct Comparison {
     clocks: WireClocks,
     channels: Vec<ChannelComparison>,
     /// What became of the datagrams with messages between the taps, on all channels together.
-    pub(super) crossing: RecordedCrossing,
+    #[serde(skip)]
+    pub(super) probed: ProbedCrossing,
     /// Channels whose transport has no datagrams of its own that a probe could read.
     left_out: Vec<String>,
 }
@@ -277,72 +278,153 @@ pub(super) fn compare(
     let compared_numbers: BTreeSet<u16> = (compared.iter())
         .filter_map(|(name, _)| numbers.get(*name).copied())
         .collect();
-    let channels = compared.into_iter().map(|(name, side)| {
+    let channels = compared.iter().map(|(name, side)| {
         let said = summary.as_ref().map(|summary| said(summary, name));
         let probe = Probe {
             captures,
             joined: &joined,
-            number: numbers.get(name).copied(),
+            number: numbers.get(*name).copied(),
         };
         channel(name, side, said.unwrap_or_default(), &probe)
     });
+    let channels: Vec<_> = channels.collect();
+    let left_out: Vec<_> = left_out.into_iter().map(|(name, _)| name.clone()).collect();
+    let passes = |(stream, joined): &&(Stream, Joined)| {
+        let own = stream.own;
+        let (first, second) = (&joined.first_point, &joined.second_point);
+        own.is_some_and(|(number, kind)| {
+            kind == Kind::Data as u8 && compared_numbers.contains(&number)
+        }) && (first.direction, second.direction) == (Direction::Outbound, Direction::Inbound)
+    };
+    let passed = joined
+        .iter()
+        .filter(passes)
+        .map(|(_, joined)| Passed::of(joined));
+    let loss = match captures.has_gaps() {
+        true => Err("a capture has gaps or faults".to_owned()),
+        false => sound_loss(&compared, &channels, &compared_numbers, captures),
+    };
+    let delays = match clocks {
+        WireClocks::One => Ok(()),
+        WireClocks::Two | WireClocks::Unknown => {
+            Err("the hosts are not known to read one clock, and a probe aligns none".to_owned())
+        }
+    };
     Ok(Comparison {
         schema_version: 1,
         run: folder.name(),
         clocks,
-        crossing: crossing(&joined, &compared_numbers, clocks),
-        channels: channels.collect(),
-        left_out: left_out.into_iter().map(|(name, _)| name.clone()).collect(),
+        probed: ProbedCrossing {
+            crossing: crossing(passed, loss, delays),
+            left_out: left_out.clone(),
+        },
+        channels,
+        left_out,
     })
 }
 
-/// What the probe saw of the datagrams with messages on the channels of these numbers.
-fn crossing(
-    joined: &[(Stream, Joined)],
-    numbers: &BTreeSet<u16>,
-    clocks: WireClocks,
-) -> RecordedCrossing {
-    let mut sum = RecordedCrossing {
-        offered_count: 0,
-        lost_count: Ok(0),
-        delays: Ok(Vec::new()),
-    };
-    let mut histogram = LatencyHistogram::default();
-    let is_data = |stream: &Stream| {
-        let own = stream.own;
-        own.is_some_and(|(number, kind)| kind == Kind::Data as u8 && numbers.contains(&number))
-    };
-    for (_, joined) in joined.iter().filter(|(stream, _)| is_data(stream)) {
+/// What the probe saw of a stream of datagrams with messages between two hosts.
+#[derive(Debug)]
+struct Passed {
+    matched_count: u64,
+    /// Else why that is unavailable.
+    lost_count: Result<u64, String>,
+    /// Likewise.
+    delays_ns: Result<Vec<i64>, String>,
+}
+
+impl Passed {
+    fn of(joined: &Joined) -> Self {
         let figures = &joined.figures;
-        sum.offered_count += figures.matched_count;
-        match (&figures.loss, &mut sum.lost_count) {
-            (Loss::Counted(loss), Ok(count)) => {
-                *count += loss.count;
-                sum.offered_count += loss.count;
-            }
-            (Loss::Counted(_), Err(_)) => {}
-            (Loss::Unavailable { doubts, .. }, lost) => {
-                *lost = Err(doubts_text(doubts, PointClocks::Unknown));
-            }
-        }
-        if figures.delay.measured().is_none() && figures.matched_count > 0 {
-            sum.delays = Err("a clock was set".to_owned());
-        }
-        for pair in joined.pairs.iter().filter(|pair| pair.is_stamped()) {
-            histogram.record(pair.second.stamp_ns.saturating_sub(pair.first.stamp_ns));
+        let lost_count = match &figures.loss {
+            _ if figures.unexplained_count > 0 => Err(format!(
+                "{} datagrams were seen at the second host only",
+                figures.unexplained_count
+            )),
+            Loss::Counted(loss) => Ok(loss.count),
+            Loss::Unavailable { doubts, .. } => Err(doubts_text(doubts, PointClocks::OneFile)),
+        };
+        let pairs = joined.pairs.iter().filter(|pair| pair.is_stamped());
+        let delay_ns = |pair: &Pair| pair.second.stamp_ns.saturating_sub(pair.first.stamp_ns);
+        let delays_ns = match &figures.delay {
+            Distribution::Measured(_) => Ok(pairs.map(delay_ns).collect()),
+            Distribution::Unavailable { .. } if figures.matched_count == 0 => Ok(Vec::new()),
+            Distribution::Unavailable { reason } => Err(reason.clone()),
+        };
+        Self {
+            matched_count: figures.matched_count,
+            lost_count,
+            delays_ns,
         }
     }
-    if clocks != WireClocks::One {
-        sum.delays = Err(clocks.words().to_owned());
+}
+
+/// All of them together, unless something speaks against `loss` or `delays` as a whole.
+fn crossing(
+    streams: impl Iterator<Item = Passed>,
+    loss: Result<(), String>,
+    delays: Result<(), String>,
+) -> RecordedCrossing {
+    let (mut matched_count, mut lost) = (0, Ok(0));
+    let mut histogram = Ok(LatencyHistogram::default());
+    for passed in streams {
+        matched_count += passed.matched_count;
+        lost = lost.and_then(|sum| passed.lost_count.map(|count| sum + count));
+        histogram = histogram.and_then(|mut histogram: LatencyHistogram| {
+            passed
+                .delays_ns?
+                .into_iter()
+                .for_each(|ns| histogram.record(ns));
+            Ok(histogram)
+        });
     }
-    if let Ok(delays) = &mut sum.delays {
-        delays.extend(histogram.bins().iter().map(|bin| DelayBin {
-            above_ns: bin.from_ns(),
-            until_ns: bin.until_ns,
-            count: bin.count,
-        }));
+    let offered_count = matched_count + *lost.as_ref().unwrap_or(&0);
+    let seen = match offered_count {
+        0 => Err("nothing was seen at both hosts".to_owned()),
+        _ => Ok(()),
+    };
+    let bins =
+        |histogram: LatencyHistogram| histogram.bins().into_iter().map(DelayBin::from).collect();
+    RecordedCrossing {
+        offered_count,
+        lost_count: loss.and(seen.clone()).and(lost),
+        delays: delays.and(seen).and(histogram.map(bins)),
     }
-    sum
+}
+
+/// What speaks against the loss that captures tell of the channels: they hold messages that are not of the run, or their
+/// counts are not the gateways'.
+fn sound_loss(
+    compared: &[(&String, &GatewaySide)],
+    channels: &[ChannelComparison],
+    numbers: &BTreeSet<u16>,
+    captures: &Reading,
+) -> Result<(), String> {
+    let records = compared.iter().flat_map(|(_, side)| &side.egress);
+    let of_run: BTreeSet<_> = records
+        .map(|one| (one.session, one.epoch, one.sequence))
+        .collect();
+    let seen = captures.observer.seen().values();
+    let headers = seen
+        .flat_map(|seen| seen.values().flatten())
+        .filter_map(own);
+    let mut messages = headers.filter(|one| is_data(one) && numbers.contains(&one.channel));
+    if messages.any(|one| !of_run.contains(&(one.session, one.epoch, one.sequence))) {
+        return Err("the captures hold messages of another run".to_owned());
+    }
+    let is_other = |one: &&ChannelComparison| {
+        let [_, _, sent, received] = one.counts();
+        [sent, received]
+            .iter()
+            .any(|(_, both, difference)| !difference.explains(*both))
+    };
+    let other = channels.iter().find(is_other);
+    other.map_or(Ok(()), |one| {
+        Err(format!(
+            "its counts of {} are not the gateways'",
+            one.channel
+        ))
+    })
 }
 
 /// Whether a channel's gateways send datagrams that stand on the wire as they made them.
@@ -719,6 +801,46 @@ mod tests {
 
     fn captured(sequences: impl Iterator<Item = u64>) -> BTreeMap<Message, u64> {
         sequences.map(|sequence| ((1, sequence), 1)).collect()
+    }
+
+    fn passed(
+        matched_count: u64,
+        lost_count: Result<u64, String>,
+        delays_ns: Result<Vec<i64>, String>,
+    ) -> Passed {
+        Passed {
+            matched_count,
+            lost_count,
+            delays_ns,
+        }
+    }
+
+    #[test]
+    fn streams_are_one_crossing_and_what_is_missing_of_one_is_missing_of_all() {
+        let sum = |streams: Vec<Passed>| crossing(streams.into_iter(), Ok(()), Ok(()));
+        let two = || {
+            vec![
+                passed(8, Ok(2), Ok(vec![20_000; 8])),
+                passed(10, Ok(0), Ok(vec![40_000; 10])),
+            ]
+        };
+        let both = sum(two());
+        assert_eq!((both.offered_count, both.lost_count), (20, Ok(2)));
+        let bins = both.delays.unwrap();
+        let counts: Vec<_> = bins.iter().map(|bin| bin.count).collect();
+        assert_eq!(counts, [8, 10]);
+        assert!(bins[0].above_ns < 20_000 && bins[0].until_ns >= 20_000);
+        let why = || "1 malformed".to_owned();
+        let mut three = two();
+        three.insert(1, passed(5, Err(why()), Err("a clock was set".to_owned())));
+        let three = sum(three);
+        assert_eq!(three.lost_count, Err(why()));
+        assert_eq!(three.delays, Err("a clock was set".to_owned()));
+        let none = sum(Vec::new());
+        assert!(none.lost_count.is_err() && none.delays.is_err());
+        let refused = crossing(two().into_iter(), Err(why()), Ok(()));
+        assert_eq!(refused.lost_count, Err(why()));
+        assert!(refused.delays.is_ok());
     }
 
     #[test]

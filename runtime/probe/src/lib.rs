@@ -68,6 +68,12 @@ pub fn run(args: &ProbeArgs, columns: usize, console: &mut Console) -> u8 {
             keep,
             reading,
         }) => {
+            // What is to be kept is kept also after Ctrl-C: a recording has no captures later.
+            let signals = keep.then(Signals::install);
+            if let Some(Err(error)) = &signals {
+                console.error(&format!("cannot handle signals: {error}"));
+                return exit::INTERNAL;
+            }
             let paths = paths(file, second.as_deref());
             let Some(captures) = read(&paths, reading, console) else {
                 return exit::USAGE;
@@ -86,7 +92,7 @@ pub fn run(args: &ProbeArgs, columns: usize, console: &mut Console) -> u8 {
                     } else {
                         text(&comparison.sections(*limit))
                     });
-                    if *keep && let Err(error) = probed::write(run, &comparison.crossing) {
+                    if *keep && let Err(error) = probed::write(run, &comparison.probed) {
                         let path = run.join(probed::FILE);
                         console.error(&format!("{}: {error}", path.display()));
                         return exit::INTERNAL;

@@ -26,6 +26,10 @@ fn open_folder(label: &str) -> RunFolder {
 
 /// Starts a run of both hosts by a user without rights. The key that the topology names is of the test's user.
 fn start(record: &RunFolder, settings: &[&str]) -> (Trial, ChildGuard) {
+    start_with(record, settings, &[])
+}
+
+fn start_with(record: &RunFolder, settings: &[&str], more: &[&str]) -> (Trial, ChildGuard) {
     let trial = Trial::shipped("shuttle-split.toml", record.path());
     let trial = settings.iter().fold(trial, |trial, one| trial.set(one));
     let mut command = Command::new("env");
@@ -35,7 +39,8 @@ fn start(record: &RunFolder, settings: &[&str]) -> (Trial, ChildGuard) {
         command.args(["--inh-caps=-all", "--bounding-set=-all"]);
     }
     command.arg(hil_runtime_binary()).args(trial.arguments());
-    command.arg("--on-one-pc").env_remove("XDG_RUNTIME_DIR");
+    command.arg("--on-one-pc").args(more);
+    command.env_remove("XDG_RUNTIME_DIR");
     (trial, ChildGuard::spawn(&mut command).unwrap())
 }
 
@@ -101,6 +106,46 @@ fn a_user_without_rights_runs_both_hosts_over_a_hop_with_kernel_stamps() {
             "{full}"
         );
     }
+    assert_nobody_left(&record);
+}
+
+#[test]
+fn a_probe_at_both_hosts_counts_what_the_gateways_do_and_replaces_no_capture() {
+    let record = open_folder("one-pc-probe");
+    let captures = record.join("captures");
+    let probe = ["--probe", captures.to_str().unwrap()];
+    let (trial, mut child) = start_with(&record, &["run.duration='2 s'"], &probe);
+    child.wait_within(LIMIT).unwrap().assert_success();
+    let [files, _] = folders(&trial);
+    let mut compare = Command::new(hil_runtime_binary());
+    // How near the medians lie is for a quiet machine.
+    compare.args(["probe", "compare", "--keep", "--limit", "100000"]);
+    compare.arg(files.root());
+    compare.args(HOSTS.map(|host| captures.join(format!("{host}.pcapng"))));
+    let compared = ChildGuard::spawn(&mut compare).unwrap().wait_within(LIMIT);
+    compared.unwrap().assert_success();
+    let kept: serde_json::Value = serde_json::from_str(&files.read("probe.json")).unwrap();
+    let crossing = &kept["crossing"];
+    assert!(crossing["offered_count"].as_u64() > Some(100), "{kept}");
+    assert_eq!(crossing["lost_count"]["Ok"], 0, "{kept}");
+    let bins = crossing["delays"]["Ok"].as_array();
+    assert!(bins.is_some_and(|bins| !bins.is_empty()), "{kept}");
+    let (_, mut again) = start_with(&record, &["run.duration='2 s'"], &probe);
+    let refused = again.wait_within(LIMIT).unwrap();
+    refused.assert_code(2);
+    let expected = "exists; give --probe another folder";
+    assert!(refused.stderr.contains(expected), "{}", refused.stderr);
+    let mut alone = trial.command_here();
+    let alone = ChildGuard::spawn(alone.args(probe))
+        .unwrap()
+        .wait_within(LIMIT);
+    let alone = alone.unwrap();
+    alone.assert_code(2);
+    assert!(
+        alone.stderr.contains("--probe is for --on-one-pc"),
+        "{}",
+        alone.stderr
+    );
     assert_nobody_left(&record);
 }
 

@@ -219,20 +219,18 @@ impl Pause {
         let why = match self.after {
             PauseAfter::Start => {
                 return format!(
-                    "the arm took no commands until {:.3} s, when its first EGM session began",
+                    "the arm was in no EGM session until {:.3} s, when its first began",
                     since(self.span.end_ns)
                 );
             }
-            PauseAfter::Session(Some(EndCause::CommTimeout)) => "EGM session ended by CommTimeout",
-            PauseAfter::Session(Some(EndCause::ConditionTime)) => "EGM session ended by CondTime",
-            PauseAfter::Session(Some(EndCause::PositionDeviation)) => {
-                "EGM session ended by MaxPosDeviation"
-            }
-            PauseAfter::Session(Some(EndCause::Requested)) => "EGM session stopped by request",
-            PauseAfter::Session(None) => "why the EGM session ended is not recorded",
+            PauseAfter::Session(Some(EndCause::CommTimeout)) => "ended by CommTimeout",
+            PauseAfter::Session(Some(EndCause::ConditionTime)) => "ended by CondTime",
+            PauseAfter::Session(Some(EndCause::PositionDeviation)) => "ended by MaxPosDeviation",
+            PauseAfter::Session(Some(EndCause::Requested)) => "stopped by request",
+            PauseAfter::Session(None) => "why it ended is not recorded",
         };
         let (begin_s, end_s) = (since(self.span.begin_ns), since(self.span.end_ns));
-        format!("the arm took no commands from {begin_s:.3} s to {end_s:.3} s ({why})")
+        format!("the arm was in no EGM session from {begin_s:.3} s to {end_s:.3} s ({why})")
     }
 }
 
@@ -541,13 +539,13 @@ mod tests {
         assert_eq!(cause(3), LossCause::Trip(first));
         assert_eq!(
             cause(3).text(1_000_000_000),
-            "the arm took no commands until 4.000 s, when its first EGM session began"
+            "the arm was in no EGM session until 4.000 s, when its first began"
         );
         // The loop's peak was due before the session ended: the text holds all the same.
         assert_eq!(cause(19), LossCause::Trip(timed_out));
         assert_eq!(
             cause(19).text(1_000_000_000),
-            "the arm took no commands from 19.000 s to 21.000 s (EGM session ended by CommTimeout)"
+            "the arm was in no EGM session from 19.000 s to 21.000 s (ended by CommTimeout)"
         );
         assert_eq!(cause(40), LossCause::Trip(unknown));
         assert_eq!(cause(60), LossCause::Held);

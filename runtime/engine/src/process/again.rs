@@ -79,9 +79,15 @@ impl Beside {
         Child::spawn_apart(&mut command).map(Self)
     }
 
-    /// Tells it to end, and kills it where it has not `within` that time.
-    pub fn end(mut self, within: Duration) {
+    /// Whether it has ended by itself.
+    pub fn is_over(&mut self) -> bool {
+        self.0.poll_end().is_some()
+    }
+
+    /// Tells it to end and gives its exit code; `None` where it was killed, as it had not ended `within` that time.
+    pub fn end(mut self, within: Duration) -> Option<i32> {
         self.0.signal(Signal::SIGTERM);
         self.0.end(Instant::now() + within);
+        self.0.poll_end()?.code()
     }
 }

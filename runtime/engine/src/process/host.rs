@@ -23,14 +23,21 @@ use hil_topology::{Host, Topology};
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
 use nix::sys::signal::Signal;
 use nix::unistd::dup2_stdin;
+use rustix::thread::{
+    CapabilitySet, capabilities, clear_ambient_capability_set, configure_capability_in_ambient_set,
+    set_capabilities,
+};
 
+use super::again::Beside;
 use super::own_program::{OwnProgramError, bind_to};
 use crate::security::PreSharedKey;
 use crate::supervisor::Child;
 
 /// The argument that asks for it.
 pub const ALL: &str = "--on-one-pc";
-/// In its place, for the supervisor of the host that follows.
+/// The argument that asks for a probe beside each host.
+const PROBE: &str = "--probe";
+/// In place of [`ALL`], for the supervisor of the host that follows.
 const ONE: &str = "--on-one-pc-as=";
 /// The key of the run's hops, in the shared memory that each host has for itself.
 pub const KEY_FILE: &str = "/dev/shm/hop.key";
@@ -124,14 +131,14 @@ pub fn check(topology: &Topology) -> Result<(), HostsError> {
 }
 
 /// The interfaces of the host called `name`, on one PC.
-pub fn interfaces(topology: &Topology, name: &str) -> Vec<String> {
+///
+/// # Errors
+/// When the hosts cannot be on one PC.
+pub fn interfaces(topology: &Topology, name: &str) -> Result<Vec<String>, HostsError> {
     let hosts = topology.hosts();
-    let ends = wires(hosts)
-        .into_iter()
-        .flatten()
-        .flat_map(|wire| wire.ends);
+    let ends = wires(hosts)?.into_iter().flat_map(|wire| wire.ends);
     let own = ends.filter(|end| hosts[end.host].name == name);
-    own.map(|end| end.interface).collect()
+    Ok(own.map(|end| end.interface).collect())
 }
 
 /// Runs all hosts of `topology`, each by the arguments of this process, and gives the exit code of the first one
@@ -331,6 +338,24 @@ fn wires(hosts: &[Host]) -> Result<Vec<Wire>, HostsError> {
     Ok(wires)
 }
 
+/// Keeps the right to capture in this host's namespaces, which any user has within them, over the change to another program.
+fn keep_right_to_capture() -> rustix::io::Result<()> {
+    let mut rights = capabilities(None)?;
+    rights.inheritable |= CapabilitySet::NET_RAW;
+    set_capabilities(None, rights)?;
+    configure_capability_in_ambient_set(CapabilitySet::NET_RAW, true)
+}
+
+/// Starts the probe of a host with `arguments`, to which alone [`become_host`] has left the right to capture.
+///
+/// # Errors
+/// When it cannot be started, or the right not be taken from what starts later.
+pub fn start_probe(arguments: &[String]) -> io::Result<Beside> {
+    let probe = Beside::start(arguments)?;
+    clear_ambient_capability_set()?;
+    Ok(probe)
+}
+
 /// Enters a host's namespaces, joined by the process at the other end of standard input, and becomes this
 /// program with `arguments`, which ends when that process does. Returns only when it fails.
 ///
@@ -356,6 +381,15 @@ pub fn become_host(starter: u32, arguments: &[String]) -> Result<(), OwnProgramE
             program: NAME.to_owned(),
             source,
         })?;
+    if arguments
+        .iter()
+        .any(|one| one.split('=').next() == Some(PROBE))
+    {
+        keep_right_to_capture().map_err(|source| OwnProgramError::Bind {
+            program: NAME.to_owned(),
+            source: source.into(),
+        })?;
+    }
     // A change of identity may have unbound it.
     bind_to(starter, NAME, Signal::SIGTERM)?;
     let source = own_process::again().args(arguments).exec();

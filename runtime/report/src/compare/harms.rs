@@ -279,7 +279,7 @@ fn too_few(
             let message_count = tested_count(&run.summary);
             too_few_occasions(&run.summary.harms, message_count, COUNT_MIN)
         })?;
-        (because, "a new run")
+        (because, "a new run where a side has one")
     };
     if let Unresolved::SampleTooSmall { what, .. } = &mut because {
         what.push_str(" in ");
@@ -420,7 +420,7 @@ mod tests {
         };
         let hurt = "CANNOT TELL: the difference of motion loops lost has no interval: as good as 17 independent ones, 64 needed";
         assert_eq!(of(0, 11), hurt);
-        let unhurt = "CANNOT TELL: the sample is too small for a NO (motion loops sent in a new run: 17, needed: 64)";
+        let unhurt = "CANNOT TELL: the sample is too small for a NO (motion loops sent in a new run where a side has one: 17, needed: 64)";
         assert_eq!(of(0, 0), unhurt);
         assert_eq!(of(11, 0), unhurt);
         // Repetitions tell, either way.

@@ -179,8 +179,10 @@ fn messages(summary: &RunSummary) -> Option<String> {
     }
     let gaps = accounts.iter().filter_map(|(name, account)| {
         let length_ns = account.gaps.longest?.length_ns;
-        let period = account.gaps.between_taken.measured();
-        Some((length_ns, *name, period.map(|one| one.p50_ns)))
+        let between = account.gaps.between_taken.measured();
+        // Messages that come many at once have no interval to name.
+        let even = between.filter(|one| 2.0 * one.p50_ns as f64 >= one.mean_ns);
+        Some((length_ns, *name, even.map(|one| one.p50_ns)))
     });
     if let Some((length_ns, name, period_ns)) = gaps.max().filter(|(length_ns, ..)| *length_ns > 0)
     {

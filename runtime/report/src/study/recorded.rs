@@ -301,11 +301,7 @@ fn crossing_of(summary: &RunSummary, crossing: &[&ChannelSummary]) -> RecordedCr
         if let Some(why) = missing(&figures.delay).filter(|_| figures.arrived_count > 0) {
             sum.delays = Err(format!("{name}: {why}"));
         } else if let Ok(delays) = &mut sum.delays {
-            delays.extend(figures.delay_bins.iter().map(|bin| DelayBin {
-                above_ns: bin.from_ns(),
-                until_ns: bin.until_ns,
-                count: bin.count,
-            }));
+            delays.extend(figures.delay_bins.iter().copied().map(DelayBin::from));
         }
     }
     sum

@@ -19,6 +19,7 @@ use hil_present::Tone;
 use hil_present::units::JOINT;
 use hil_rundir::event::ProcessKind;
 use hil_rundir::pipe::{CountByName, CounterGroup};
+use hil_stats::histogram::Distribution;
 
 fn lost_loops(count: Option<u64>, own_count: u64, sent_count: u64) -> HarmCount {
     HarmCount {
@@ -208,7 +209,7 @@ fn a_sample_that_is_too_small_shows_no_absence_of_harm() {
     count_all(&mut enough);
     let page = brief(&enough, 100, Style::Plain);
     let page = page.split_whitespace().collect::<Vec<_>>().join(" ");
-    let means = "NO means fewer than 300 harms per 1,000 motion loops sent (95 %; those that come together count as one)";
+    let means = "NO means no such harm in 10 motion loops sent: 300 per 1,000 or more are excluded (95 %); a larger sample excludes lower rates";
     assert!(page.contains(means), "{page}");
     let enough = answer(&enough);
     assert_eq!((enough.hurt.clone(), enough.tone()), (Hurt::No, Tone::Good));
@@ -662,6 +663,18 @@ fn answer_cause_and_validity_stand_in_twelve_lines() {
     ] {
         assert!(block.contains(words), "{words}:\n{block}");
     }
+    // What comes many at once is due at no interval.
+    let mut summary = run(lost_loops(Some(2), 0, 40));
+    for account in summary
+        .channels
+        .iter_mut()
+        .filter_map(|one| one.account.as_mut())
+    {
+        account.gaps.between_taken = Distribution::of_samples(&[700, 700, 700, 30_000_000], "");
+    }
+    let page = brief(&summary, 100, Style::Plain);
+    let page = page.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(page.contains("after one was due, on"), "{page}");
 }
 
 #[test]

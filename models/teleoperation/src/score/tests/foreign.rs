@@ -177,7 +177,7 @@ fn loops_before_the_first_session_are_lost_because_none_had_begun() {
     let lost = |event: &&hil_core::score::ScoreEvent| event.severity == Severity::Incident;
     let incident = score.events.iter().find(lost).unwrap();
     assert!(
-        incident.what.contains("took no commands until 9.000 s"),
+        incident.what.contains("in no EGM session until 9.000 s"),
         "{}",
         incident.what
     );

@@ -18,9 +18,10 @@ use hil_platform::progress::Progress;
 use hil_platform::signals::Signals;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
+use hil_protocol::transport::IpProtocol;
 use hil_stats::recorded::RecordedRow;
 use hil_topology::registry::Registry;
-use hil_topology::{Recording, Topology};
+use hil_topology::{Link, Recording, Topology, Via};
 use serde_json::Value;
 
 use self::folder::{Part, RowFolder};
@@ -165,6 +166,18 @@ impl Row<'_> {
         }
     }
 
+    /// The arguments that keep what its probe saw of the run in `folder`.
+    fn probe_comparison(&self, folder: &Path) -> Vec<String> {
+        let mut arguments = ["probe", "compare", "--keep"].map(str::to_owned).to_vec();
+        arguments.push(folder.display().to_string());
+        let captures = self.probed.iter().map(|host| {
+            let file = self.folder.captures().join(format!("{host}.pcapng"));
+            file.display().to_string()
+        });
+        arguments.extend(captures);
+        arguments
+    }
+
     /// What its folder holds.
     fn found(&self) -> Result<Found, RecordingError> {
         let mut found = Found::default();
@@ -192,6 +205,15 @@ impl Row<'_> {
         if !differences.is_empty() {
             return Err(format!(
                 "{} was recorded with other keys: {differences}; give the file another `folder`, or remove this one",
+                folder.display()
+            ));
+        }
+        if matches!(part, Part::Run(_))
+            && !self.probed.is_empty()
+            && !folder.join(probed::FILE).is_file()
+        {
+            return Err(format!(
+                "{} was recorded without a probe; leave out `probe`, give the file another `folder`, or remove this one",
                 folder.display()
             ));
         }
@@ -390,14 +412,24 @@ fn rows<'a>(
 
 /// The hosts at which a probe captures; else why its figures would not be the network's.
 fn probed_hosts(topology: &Topology, host: Option<&str>) -> Result<Vec<String>, &'static str> {
-    let mut links = topology.links().iter();
+    let links = topology.links();
     if host.is_some() {
-        return Err("--host is given: start `hil-runtime probe` beside each host's run");
+        return Err(
+            "with --host each PC has a capture of its own; leave out `probe`, make runs by hand with `hil-runtime probe` beside \
+             them, and give them with --run",
+        );
     }
-    if links.any(|link| link.emulation().is_some()) {
+    if links.iter().any(|link| link.emulation().is_some()) {
         return Err(
             "a link is emulated: its gateways keep what it delays and drop what it loses before the wire",
         );
+    }
+    let is_of_datagrams = |link: &Link| match &link.via {
+        Via::Network(hop) => hop.transport.capabilities.receiver_port != Some(IpProtocol::Tcp),
+        _ => false,
+    };
+    if !links.iter().any(is_of_datagrams) {
+        return Err("no link has datagrams that a probe can read");
     }
     match topology.hosts() {
         [one, other] => Ok(vec![one.name.clone(), other.name.clone()]),
@@ -653,11 +685,8 @@ impl RunMaker<'_> {
                 _ => Made::Hopeless(why),
             });
         }
-        if let Some(folder) = folder.as_ref().filter(|_| !row.probed.is_empty()) {
-            self.compare_probe(row, folder).map_err(failed)?;
-        }
         let mut ended_elsewhere = None;
-        let outcome = folder
+        let mut outcome = folder
             .ok_or_else(|| self.said.last_line())
             .and_then(|folder| {
                 let run = ComparedRun::read(&folder).map_err(|error| error.to_string())?;
@@ -665,17 +694,24 @@ impl RunMaker<'_> {
                 ended_elsewhere =
                     (facts.outcome == Outcome::Stopped).then(|| facts.exit_reason.clone());
                 let count = row.judge(run, part)?;
-                if !row.probed.is_empty() && !folder.join(probed::FILE).is_file() {
-                    let why = self.said.last_line();
-                    return Err(format!("its probe's captures tell nothing: {why}"));
-                }
                 Ok(Made::Sound { folder, count })
             });
         if let (Ok(Made::Sound { folder, .. }), Part::Run(_)) = (&outcome, part) {
-            // After a signal as well: the run is whole, and its traces are not kept.
+            // After a signal as well: the run is whole, and neither its captures nor its traces are kept.
             let console = &mut *self.console;
-            trace_replay::write(folder, self.registry, &mut || meanwhile(1.0, console))
-                .map_err(failed)?;
+            let mut meanwhile = || meanwhile(1.0, console);
+            if row.probed.is_empty() {
+                trace_replay::write(folder, self.registry, &mut meanwhile).map_err(failed)?;
+            } else {
+                let arguments = row.probe_comparison(folder);
+                (self.start)(&arguments, &self.said.file, &mut meanwhile).map_err(failed)?;
+                if folder.join(probed::FILE).is_file() {
+                    trace_replay::write(folder, self.registry, &mut meanwhile).map_err(failed)?;
+                } else {
+                    let why = self.said.last_line();
+                    outcome = Err(format!("its probe's captures tell nothing: {why}"));
+                }
+            }
         }
         Ok(match outcome {
             Ok(made) => made,
@@ -683,24 +719,6 @@ impl RunMaker<'_> {
             // As the call on the host that ended it, this one makes it again: all hosts make the same runs.
             Err(why) => ended_elsewhere.map_or(Made::Refused(why), Made::Hopeless),
         })
-    }
-}
-
-impl RunMaker<'_> {
-    /// Keeps what the probe saw of the run in `folder`.
-    fn compare_probe(&mut self, row: &Row<'_>, folder: &Path) -> io::Result<()> {
-        let mut arguments = vec![
-            "probe".to_owned(),
-            "compare".to_owned(),
-            "--keep".to_owned(),
-        ];
-        arguments.push(folder.display().to_string());
-        let captures = row.probed.iter();
-        arguments.extend(captures.map(|host| {
-            let file = row.folder.captures().join(format!("{host}.pcapng"));
-            file.display().to_string()
-        }));
-        (self.start)(&arguments, &self.said.file, &mut || {}).map(drop)
     }
 }
 
@@ -746,6 +764,7 @@ mod tests {
                 is_tried: true,
             },
             case: "shuttle",
+            probed: Vec::new(),
             folder: RowFolder::new(PathBuf::from("runs/a")),
         }
     }
@@ -878,10 +897,26 @@ mod tests {
             tables: FILE.to_owned(),
             ..Recording::TEMPLATE
         };
-        let error = rows(&recording, &topology(&[]), &registry()).unwrap_err();
+        let error = rows(&recording, &topology(&[]), &registry(), None).unwrap_err();
         assert_eq!(
             error.to_string(),
             format!("{FILE}: case shuttle has no rows of recorded runs")
         );
+    }
+
+    #[test]
+    fn a_probe_is_where_it_sees_the_network_of_both_hosts() {
+        let hosts = |overrides: &[&str], host| probed_hosts(&topology(overrides), host);
+        let both = vec!["control-pc".to_owned(), "robot-pc".to_owned()];
+        assert_eq!(hosts(&[], None), Ok(both));
+        let emulated = ["links.hop.via=emulated", "links.hop.delay=1 ms"];
+        for (overrides, host, expected) in [
+            (&[][..], Some("robot-pc"), "make runs by hand"),
+            (&emulated, None, "a link is emulated"),
+            (&["links.hop.via=tcp"], None, "no link has datagrams"),
+        ] {
+            let why = hosts(overrides, host).unwrap_err();
+            assert!(why.contains(expected), "{why}");
+        }
     }
 }
