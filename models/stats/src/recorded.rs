@@ -316,29 +316,35 @@ impl<P> RecordedRow<P> {
         delay_ms(self.crossings(), quantile)
     }
 
-    /// Loss and delay by the passive probe, of the runs that had one; `None` of none.
+    /// Loss and delay by the passive probe, each of the runs of which it is known; `None` where no run was probed.
     fn probed(&self) -> Option<String> {
         let probed = self.runs.iter().filter_map(|run| run.probed.as_ref());
-        let of = match probed.clone().count() {
-            0 => return None,
-            count if count == self.runs.len() => String::new(),
-            count => format!(" of {count} of {} runs", self.runs.len()),
-        };
+        probed.clone().next()?;
         let crossings = probed.clone().map(|one| &one.crossing);
-        let unavailable = |why: Option<&String>| match why {
-            Some(why) => format!("unavailable ({why})"),
-            None => "unavailable".to_owned(),
+        let words = |found: Option<String>, known_count: usize, why: Option<&String>| {
+            let why = why.map_or_else(String::new, |why| format!(" ({why})"));
+            match (found, self.runs.len()) {
+                (None, _) => format!("unavailable{why}"),
+                (Some(found), count) if count == known_count => found,
+                (Some(found), count) => format!("{found} in {known_count} of {count} runs{why}"),
+            }
         };
-        let mut without = (crossings.clone()).filter_map(|one| one.lost_count.as_ref().err());
-        let loss = match loss_ratio(crossings.clone()) {
-            Some(ratio) => format!("{ratio:.4}"),
-            None => unavailable(without.next()),
-        };
-        let mut without = (crossings.clone()).filter_map(|one| one.delays.as_ref().err());
-        let delays = match [0.5, 0.99].map(|quantile| delay_ms(crossings.clone(), quantile)) {
-            [Some(p50), Some(p99)] => format!("p50 {p50:.3} ms, p99 {p99:.3} ms"),
-            _ => unavailable(without.next()),
-        };
+        let known = crossings.clone().filter(|one| one.lost_count.is_ok());
+        let loss = words(
+            loss_ratio(known.clone()).map(|ratio| format!("{ratio:.4}")),
+            known.count(),
+            crossings
+                .clone()
+                .find_map(|one| one.lost_count.as_ref().err()),
+        );
+        let known = crossings.clone().filter(|one| one.delays.is_ok());
+        let [p50, p99] = [0.5, 0.99].map(|quantile| delay_ms(known.clone(), quantile));
+        let delay = words(
+            p50.zip(p99)
+                .map(|(p50, p99)| format!("p50 {p50:.3} ms, p99 {p99:.3} ms")),
+            known.count(),
+            crossings.clone().find_map(|one| one.delays.as_ref().err()),
+        );
         let left_out: BTreeSet<&str> = (probed.flat_map(|one| &one.left_out))
             .map(String::as_str)
             .collect();
@@ -350,7 +356,7 @@ impl<P> RecordedRow<P> {
             }
         };
         Some(format!(
-            "datagrams by the passive probe{of}: PLR {loss}, delay {delays}{without}"
+            "datagrams by the passive probe: PLR {loss}, delay {delay}{without}"
         ))
     }
 
@@ -831,7 +837,7 @@ mod tests {
             crossing: one.crossing.clone(),
             left_out: vec!["b".to_owned(), "a".to_owned()],
         });
-        let words = "datagrams by the passive probe of 1 of 2 runs: PLR 0.0100, delay p50 2.000 ms, p99 3.960 ms, \
+        let words = "datagrams by the passive probe: PLR 0.0100 in 1 of 2 runs, delay p50 2.000 ms, p99 3.960 ms in 1 of 2 runs, \
                      without a and b (TCP)";
         assert!(
             note(&[&one, &other]).contains(words),
@@ -841,17 +847,19 @@ mod tests {
         other.probed = Some(ProbedCrossing {
             crossing: RecordedCrossing {
                 offered_count: 1000,
-                lost_count: Err("2 malformed".to_owned()),
+                lost_count: Ok(0),
                 delays: Err("two clocks".to_owned()),
             },
             left_out: Vec::new(),
         });
-        let words = "by the passive probe: PLR unavailable (2 malformed), delay unavailable (two clocks), without";
+        let words = "PLR 0.0050, delay p50 2.000 ms, p99 3.960 ms in 1 of 2 runs (two clocks), without a and b";
         assert!(
             note(&[&one, &other]).contains(words),
             "{}",
             note(&[&one, &other])
         );
+        let words = "by the passive probe: PLR 0.0000, delay unavailable (two clocks)";
+        assert!(note(&[&other]).contains(words), "{}", note(&[&other]));
         one.replays = Ok(vec![one.score.clone()]);
         let replay = RecordedRow::of_runs(vec![one], |_, _| true)[0].replayed();
         assert_eq!(replay.unwrap().first().probed, None);

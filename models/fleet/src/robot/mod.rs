@@ -241,22 +241,16 @@ impl Robot {
         }
     }
 
-    /// Sets the next tick: on the grid of the robot's own phase, but for the legacy tracker under
-    /// way, which waits a period from whenever it has done.
+    /// Sets the next tick: on the grid of the robot's own phase, which `step_inflation` moves with each tick of the legacy tracker
+    /// under way, as the original waits a period from when it has done. A host that is late moves no grid: robots that it
+    /// serves together would step together from then on.
     fn schedule(&mut self, now: Instant) {
-        if self.holder.is_under_way() && matches!(self.tracker, Tracker::Legacy(_)) {
-            let extra_ns = if self.inflation_ns > 0.0 {
-                whole_ns(self.random.uniform() * self.inflation_ns)
-            } else {
-                0
-            };
-            self.next_report = after(now, self.tracking_period_ns + extra_ns);
-            return;
-        }
-        let period_ns = if self.holder.is_under_way() {
-            self.tracking_period_ns
-        } else {
+        let period_ns = if !self.holder.is_under_way() {
             self.parked_period_ns
+        } else if self.inflation_ns > 0.0 && matches!(self.tracker, Tracker::Legacy(_)) {
+            self.tracking_period_ns + whole_ns(self.random.uniform() * self.inflation_ns)
+        } else {
+            self.tracking_period_ns
         };
         self.next_report = after(self.next_report, period_ns);
         if self.next_report <= now {

@@ -412,3 +412,19 @@ fn states_come_every_tracking_period_under_way_and_rarely_when_parked() {
     assert_eq!(state.sampled_ns, 12_000_000_000);
     assert!((32..=33).contains(&driving.counters().skipped_ticks_count));
 }
+
+#[test]
+fn a_host_that_is_late_moves_no_grid_of_the_stepped_tracker_and_counts_what_it_left_out() {
+    let scene = scene(Scenario::Crossing);
+    let mut robot = under_way(&scene, TrackerKind::LegacyRk4, at(1.0));
+    let period = Duration::from_millis(30);
+    let first = robot.next_event();
+    let mut late = |due: Instant, by_ms: u64| {
+        let now = due + Duration::from_millis(by_ms);
+        assert!(robot.on_event(now, &mut |_| {}).is_some());
+        (robot.next_event(), robot.counters().skipped_ticks_count)
+    };
+    assert_eq!(late(first, 10), (first + period, 0));
+    assert_eq!(late(first + period, 0), (first + 2 * period, 0));
+    assert_eq!(late(first + 2 * period, 70), (first + 5 * period, 2));
+}
