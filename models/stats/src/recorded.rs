@@ -348,12 +348,11 @@ impl<P> RecordedRow<P> {
         let left_out: BTreeSet<&str> = (probed.flat_map(|one| &one.left_out))
             .map(String::as_str)
             .collect();
-        let without = match left_out.is_empty() {
-            true => String::new(),
-            false => {
-                let names: Vec<_> = left_out.into_iter().collect();
-                format!(", without {} (TCP)", names.join(" and "))
-            }
+        let without = if left_out.is_empty() {
+            String::new()
+        } else {
+            let names: Vec<_> = left_out.into_iter().collect();
+            format!(", without {} (TCP)", names.join(" and "))
         };
         Some(format!(
             "datagrams by the passive probe: PLR {loss}, delay {delay}{without}"
@@ -828,11 +827,11 @@ mod tests {
         let [mut one, mut other] =
             [("a", 3), ("b", 4)].map(|(folder, seed)| run(folder, short, seed));
         let none = PooledShare::of(&[], None);
-        let note = |runs: &[&RecordedRun<u8>]| {
+        let note_of = |runs: &[&RecordedRun<u8>]| {
             let runs = runs.iter().map(|run| (*run).clone()).collect();
             RecordedRow::of_runs(runs, |_, _| true)[0].note(&none)
         };
-        assert!(!note(&[&one, &other]).contains("probe"));
+        assert!(!note_of(&[&one, &other]).contains("probe"));
         one.probed = Some(ProbedCrossing {
             crossing: one.crossing.clone(),
             left_out: vec!["b".to_owned(), "a".to_owned()],
@@ -840,9 +839,9 @@ mod tests {
         let words = "datagrams by the passive probe: PLR 0.0100 in 1 of 2 runs, delay p50 2.000 ms, p99 3.960 ms in 1 of 2 runs, \
                      without a and b (TCP)";
         assert!(
-            note(&[&one, &other]).contains(words),
+            note_of(&[&one, &other]).contains(words),
             "{}",
-            note(&[&one, &other])
+            note_of(&[&one, &other])
         );
         other.probed = Some(ProbedCrossing {
             crossing: RecordedCrossing {
@@ -854,12 +853,12 @@ mod tests {
         });
         let words = "PLR 0.0050, delay p50 2.000 ms, p99 3.960 ms in 1 of 2 runs (two clocks), without a and b";
         assert!(
-            note(&[&one, &other]).contains(words),
+            note_of(&[&one, &other]).contains(words),
             "{}",
-            note(&[&one, &other])
+            note_of(&[&one, &other])
         );
         let words = "by the passive probe: PLR 0.0000, delay unavailable (two clocks)";
-        assert!(note(&[&other]).contains(words), "{}", note(&[&other]));
+        assert!(note_of(&[&other]).contains(words), "{}", note_of(&[&other]));
         one.replays = Ok(vec![one.score.clone()]);
         let replay = RecordedRow::of_runs(vec![one], |_, _| true)[0].replayed();
         assert_eq!(replay.unwrap().first().probed, None);

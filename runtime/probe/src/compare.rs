@@ -289,7 +289,7 @@ pub(super) fn compare(
     });
     let channels: Vec<_> = channels.collect();
     let left_out: Vec<_> = left_out.into_iter().map(|(name, _)| name.clone()).collect();
-    let passes = |(stream, joined): &&(Stream, Joined)| {
+    let is_meant = |(stream, joined): &&(Stream, Joined)| {
         let own = stream.own;
         let (first, second) = (&joined.first_point, &joined.second_point);
         own.is_some_and(|(number, kind)| {
@@ -298,11 +298,12 @@ pub(super) fn compare(
     };
     let passed = joined
         .iter()
-        .filter(passes)
+        .filter(is_meant)
         .map(|(_, joined)| Passed::of(joined));
-    let loss = match captures.has_gaps() {
-        true => Err("a capture has gaps or faults".to_owned()),
-        false => sound_loss(&compared, &channels, &compared_numbers, captures),
+    let loss = if captures.has_gaps() {
+        Err("a capture has gaps or faults".to_owned())
+    } else {
+        sound_loss(&compared, &channels, &compared_numbers, captures)
     };
     let delays = match clocks {
         WireClocks::One => Ok(()),
@@ -345,9 +346,9 @@ impl Passed {
             Loss::Unavailable { doubts, .. } => Err(doubts_text(doubts, PointClocks::OneFile)),
         };
         let pairs = joined.pairs.iter().filter(|pair| pair.is_stamped());
-        let delay_ns = |pair: &Pair| pair.second.stamp_ns.saturating_sub(pair.first.stamp_ns);
+        let of_pair = |pair: &Pair| pair.second.stamp_ns.saturating_sub(pair.first.stamp_ns);
         let delays_ns = match &figures.delay {
-            Distribution::Measured(_) => Ok(pairs.map(delay_ns).collect()),
+            Distribution::Measured(_) => Ok(pairs.map(of_pair).collect()),
             Distribution::Unavailable { .. } if figures.matched_count == 0 => Ok(Vec::new()),
             Distribution::Unavailable { reason } => Err(reason.clone()),
         };
@@ -365,11 +366,11 @@ fn crossing(
     loss: Result<(), String>,
     delays: Result<(), String>,
 ) -> RecordedCrossing {
-    let (mut matched_count, mut lost) = (0, Ok(0));
+    let (mut matched_count, mut lost_count) = (0, Ok(0));
     let mut histogram = Ok(LatencyHistogram::default());
     for passed in streams {
         matched_count += passed.matched_count;
-        lost = lost.and_then(|sum| passed.lost_count.map(|count| sum + count));
+        lost_count = lost_count.and_then(|sum| passed.lost_count.map(|count| sum + count));
         histogram = histogram.and_then(|mut histogram: LatencyHistogram| {
             passed
                 .delays_ns?
@@ -378,7 +379,7 @@ fn crossing(
             Ok(histogram)
         });
     }
-    let offered_count = matched_count + *lost.as_ref().unwrap_or(&0);
+    let offered_count = matched_count + *lost_count.as_ref().unwrap_or(&0);
     let seen = match offered_count {
         0 => Err("nothing was seen at both hosts".to_owned()),
         _ => Ok(()),
@@ -387,7 +388,7 @@ fn crossing(
         |histogram: LatencyHistogram| histogram.bins().into_iter().map(DelayBin::from).collect();
     RecordedCrossing {
         offered_count,
-        lost_count: loss.and(seen.clone()).and(lost),
+        lost_count: loss.and(seen.clone()).and(lost_count),
         delays: delays.and(seen).and(histogram.map(bins)),
     }
 }

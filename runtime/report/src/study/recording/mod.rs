@@ -385,10 +385,11 @@ fn rows<'a>(
         let is_tried = sample
             .copies
             .is_some_and(|key| !row.sets(&format!("{PARAMETERS}{key}")));
-        let probed = match row.probe {
-            true => probed_hosts(&topology, host)
-                .map_err(|why| refused(format!("probe = true, and {why}")))?,
-            false => Vec::new(),
+        let probed = if row.probe {
+            let hosts = probed_hosts(&topology, host);
+            hosts.map_err(|why| refused(format!("probe = true, and {why}")))?
+        } else {
+            Vec::new()
         };
         Ok(Row {
             name,
