@@ -346,9 +346,8 @@ fn start_probe(topology: &Topology, folder: &Path, host: &str) -> Result<Beside,
     let deadline = Instant::now() + PROBE_BEGINS_WITHIN;
     while fs::metadata(&output).map_or(0, |file| file.len()) == 0 {
         if probe.is_over() || Instant::now() >= deadline {
-            let code = probe
-                .end(Duration::ZERO)
-                .and_then(|code| u8::try_from(code).ok());
+            let code = probe.end(Duration::ZERO).filter(|code| *code != 0);
+            let code = code.and_then(|code| u8::try_from(code).ok());
             let text = format!("the probe of {host} does not capture, so that nothing is run");
             return Err(Refusal::new(code.unwrap_or(exit::FAILED), text));
         }

@@ -209,7 +209,7 @@ pub(super) struct Comparison {
     run: String,
     clocks: WireClocks,
     channels: Vec<ChannelComparison>,
-    /// What became of the datagrams with messages between the taps, on all channels together.
+    /// Loss and delay of the datagrams with messages between the taps, on all channels together.
     #[serde(skip)]
     pub(super) probed: ProbedCrossing,
     /// Channels whose transport has no datagrams of its own that a probe could read.

@@ -385,9 +385,9 @@ pub fn become_host(starter: u32, arguments: &[String]) -> Result<(), OwnProgramE
         .iter()
         .any(|one| one.split('=').next() == Some(PROBE))
     {
-        keep_right_to_capture().map_err(|source| OwnProgramError::Bind {
+        keep_right_to_capture().map_err(|source| OwnProgramError::Realtime {
             program: NAME.to_owned(),
-            source: source.into(),
+            refusal: format!("the right to capture: {source}"),
         })?;
     }
     // A change of identity may have unbound it.
