@@ -109,6 +109,35 @@ pub struct RecordedMetric {
     pub interval: Option<Spread>,
 }
 
+/// Ticks that a run's processes passed over.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct SkippedTicks {
+    /// So many.
+    pub skipped_count: u64,
+    /// Of so many that were due.
+    pub due_count: u64,
+}
+
+impl SkippedTicks {
+    /// True where more than this share of the ticks was skipped.
+    pub fn is_above(self, ratio: f64) -> bool {
+        self.skipped_count as f64 > ratio * self.due_count as f64
+    }
+}
+
+impl fmt::Display for SkippedTicks {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            skipped_count,
+            due_count,
+        } = self;
+        write!(
+            formatter,
+            "{skipped_count} of {due_count} ticks were skipped"
+        )
+    }
+}
+
 /// Why a recorded run may not be held against the published one.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Doubt {
@@ -122,13 +151,8 @@ pub enum Doubt {
         /// What is said of the measurement, in words.
         measurement: String,
     },
-    /// Processes passed over ticks.
-    SkippedTicks {
-        /// So many.
-        skipped_count: u64,
-        /// Of so many that were due.
-        due_count: u64,
-    },
+    /// Processes passed over more ticks than the row allows.
+    SkippedTicks(SkippedTicks),
     /// A link was changed while the run went on.
     LinkChanged,
     /// Records of what the robot did are missing.
@@ -154,13 +178,7 @@ impl fmt::Display for Doubt {
         match self {
             Self::Stopped { reason } => write!(formatter, "it did not run its length: {reason}"),
             Self::NotValid { measurement } => write!(formatter, "measurement {measurement}"),
-            Self::SkippedTicks {
-                skipped_count,
-                due_count,
-            } => write!(
-                formatter,
-                "{skipped_count} of {due_count} ticks were skipped"
-            ),
+            Self::SkippedTicks(ticks) => ticks.fmt(formatter),
             Self::LinkChanged => formatter.write_str("a link was changed while it went on"),
             Self::ScoreIncomplete => {
                 formatter.write_str("records of what the robot did are missing")
@@ -201,6 +219,8 @@ pub struct RecordedRun<P> {
     pub seed: u64,
     /// Its `[case.parameters]`.
     pub parameters: P,
+    /// What its processes did not keep up with.
+    pub skipped: SkippedTicks,
     /// What the network did to its messages.
     pub crossing: RecordedCrossing,
     /// The same by a passive probe; `None` where none was there.
@@ -270,6 +290,7 @@ impl<P> RecordedRun<P> {
             link: self.link,
             seed: self.seed,
             parameters,
+            skipped: self.skipped,
             crossing: self.crossing,
             probed: self.probed,
             score: self.score,

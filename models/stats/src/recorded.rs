@@ -5,7 +5,7 @@ use core::fmt;
 use std::collections::{BTreeMap, BTreeSet};
 
 use hil_core::interval::{Interval, Spread, TooSmall};
-use hil_core::recorded_run::{Doubt, LinkOrigin, RecordedCrossing, RecordedRun};
+use hil_core::recorded_run::{Doubt, LinkOrigin, RecordedCrossing, RecordedRun, SkippedTicks};
 use hil_core::study::Verdict;
 
 use crate::comparison::{Estimate, Judge, Scatter, Share, estimate_against_published};
@@ -260,6 +260,7 @@ impl<P> RecordedRow<P> {
                 RecordedRun {
                     score: score.clone(),
                     replays: Ok(Vec::new()),
+                    skipped: SkippedTicks::default(),
                     probed: None,
                     crossing: RecordedCrossing {
                         offered_count: 0,
@@ -277,6 +278,34 @@ impl<P> RecordedRow<P> {
             is_named_by_folder: self.is_named_by_folder,
             is_replay: true,
         })
+    }
+
+    /// What happened in each of its runs, as `of` reads it; in replays of one run together, which share its trace.
+    ///
+    /// # Errors
+    /// The first of `of`.
+    pub fn shares<E>(
+        &self,
+        of: impl Fn(&RecordedRun<P>) -> Result<RunShare, E>,
+    ) -> Result<Vec<RunShare>, E> {
+        let of_trace = |runs: &[RecordedRun<P>]| {
+            let mut runs = runs.iter().map(&of);
+            let first = runs.next().expect("a chunk is not empty")?;
+            runs.try_fold(first, |sum, one| {
+                let one = one?.share;
+                Ok(RunShare {
+                    share: Share {
+                        count: sum.share.count + one.count,
+                        of: sum.share.of + one.of,
+                    },
+                    ..sum
+                })
+            })
+        };
+        let traces = self
+            .runs
+            .chunk_by(|one, other| self.is_replay && one.folder == other.folder);
+        traces.map(of_trace).collect()
     }
 
     /// True of what happened in replays.
@@ -314,6 +343,21 @@ impl<P> RecordedRow<P> {
     /// bin; `None` where delays are unavailable of a run.
     pub fn delay_ms(&self, quantile: f64) -> Option<f64> {
         delay_ms(self.crossings(), quantile)
+    }
+
+    /// The skipped ticks that the row allowed; `None` where none was skipped.
+    fn allowed_skips(&self) -> Option<String> {
+        let sound = self.runs.iter().filter(|run| run.is_sound());
+        let all: Vec<SkippedTicks> = sound.map(|run| run.skipped).collect();
+        let some_count = all.iter().filter(|one| one.skipped_count > 0).count();
+        let sum = SkippedTicks {
+            skipped_count: all.iter().map(|one| one.skipped_count).sum(),
+            due_count: all.iter().map(|one| one.due_count).sum(),
+        };
+        (some_count > 0).then(|| match all.len() {
+            1 => format!("host: {sum}"),
+            count => format!("host: {sum}, in {some_count} of {count} runs"),
+        })
     }
 
     /// Loss and delay by the passive probe, each of the runs of which it is known; `None` where no run was probed.
@@ -392,6 +436,7 @@ impl<P> RecordedRow<P> {
             first.link.about.clone(),
             happened.basis.to_string(),
         ];
+        parts.extend(self.allowed_skips());
         parts.extend(self.probed());
         if first.network.is_none() {
             parts.push("not comparable: no label says for which network it stands".to_owned());
@@ -500,6 +545,7 @@ mod tests {
     use hil_core::recorded_run::{
         DelayBin, ProbedCrossing, PublishedNetwork, RecordedCrossing, RecordedLink, RecordedMetric,
     };
+    use hil_core::study::StudyRefusal;
 
     const fn share(count: u64, of: u64) -> Share {
         Share { count, of }
@@ -534,6 +580,7 @@ mod tests {
                 ]),
             },
             score: BTreeMap::new(),
+            skipped: SkippedTicks::default(),
             probed: None,
             replays: Ok(Vec::new()),
             doubts: Vec::new(),
@@ -653,10 +700,10 @@ mod tests {
         let short = Some(PublishedNetwork::ShortRange);
         let late = |folder: &str, seed| {
             let mut run = run(folder, short, seed);
-            run.doubts.push(Doubt::SkippedTicks {
+            run.doubts.push(Doubt::SkippedTicks(SkippedTicks {
                 skipped_count: 3,
                 due_count: 500,
-            });
+            }));
             run
         };
         let row = |runs| RecordedRow::of_runs(runs, |_, _| true).remove(0);
@@ -678,6 +725,28 @@ mod tests {
         assert!(
             note.contains(": b; hop") && note.ends_with(expected),
             "{note}"
+        );
+        let allowed = |folder: &str, seed, skipped_count| RecordedRun {
+            skipped: SkippedTicks {
+                skipped_count,
+                due_count: 500 * skipped_count,
+            },
+            ..run(folder, short, seed)
+        };
+        let one = row(vec![allowed("a", 1, 1)]).note(&happened);
+        assert!(one.contains("; host: 1 of 500 ticks were skipped"), "{one}");
+        let some = row(vec![
+            allowed("a", 1, 1),
+            allowed("b", 2, 3),
+            run("c", short, 3),
+        ]);
+        let some = some.note(&happened);
+        let expected = "; host: 4 of 2000 ticks were skipped, in 2 of 3 runs";
+        assert!(some.contains(expected), "{some}");
+        assert!(
+            !row(vec![run("c", short, 3)])
+                .note(&happened)
+                .contains("host:")
         );
         let doubted = row(vec![late("a", 1), late("b", 2)]);
         assert_eq!(doubted.runs().len(), 2);
@@ -734,10 +803,10 @@ mod tests {
         assert_eq!(verdict(&unlabelled), Verdict::NotComparable);
         assert!(unlabelled.note(&happened).contains("no label"));
         let mut late = run("runs/a", short, 1);
-        late.doubts.push(Doubt::SkippedTicks {
+        late.doubts.push(Doubt::SkippedTicks(SkippedTicks {
             skipped_count: 3,
             due_count: 500,
-        });
+        }));
         let late = of(late);
         assert_eq!(verdict(&late), Verdict::NotComparable);
         let expected = "not comparable: 3 of 500 ticks were skipped";
@@ -794,6 +863,7 @@ mod tests {
             ..other.clone()
         };
         let without = RecordedRun {
+            skipped: SkippedTicks::default(),
             probed: None,
             replays: Ok(Vec::new()),
             ..other.clone()
@@ -815,6 +885,24 @@ mod tests {
             replay.method(),
             "Replay, short-range Wi-Fi 6, emulated link"
         );
+        // Replays of one trace are one trial, however many.
+        let shares = |row: &RecordedRow<u8>| -> Vec<Share> {
+            let of_run = |_: &RecordedRun<u8>| {
+                Ok::<_, StudyRefusal>(RunShare {
+                    share: share(1, 10),
+                    interval: None,
+                })
+            };
+            let found = row.shares(of_run).unwrap();
+            found.into_iter().map(|one| one.share).collect()
+        };
+        let (recorded, traces) = (shares(&row), shares(&replay));
+        assert_eq!(
+            (recorded.len(), traces.len()),
+            (row.runs().len(), row.runs().len())
+        );
+        let replays: u64 = traces.iter().map(|one| one.count).sum();
+        assert_eq!(replays, replay.runs().len() as u64);
         // Loss and delay are those of the row.
         assert_eq!((replay.loss_ratio(), replay.delay_ms(0.5)), (None, None));
         let alone = RecordedRow::of_runs(vec![run("c", short, 3)], |_, _| true);

@@ -463,7 +463,7 @@ pub(crate) fn none_means(what: &str, count: u64) -> String {
     let most = upper_bound(-1e3 * (1.0 - CONFIDENCE).ln() / count.max(1) as f64);
     let percent = 100.0 * CONFIDENCE;
     format!(
-        "no such harm in {} {what}: {most} per 1,000 or more are excluded ({percent:.0}{JOINT}%); a larger sample excludes lower rates",
+        "none in {} {what} excludes a rate of {most} per 1,000 or more ({percent:.0}{JOINT}%)",
         grouped(count)
     )
 }

@@ -53,6 +53,8 @@ options! {
         seed: u64 = 1, in 0..=u64::from(u32::MAX);
         /// Whether a passive probe captures at both hosts of a run on one PC, for loss and delay beside the account's.
         probe: bool = false;
+        /// Share of their ticks that the processes of a run together may have skipped: a run that skipped more is refused.
+        skipped_ratio_max: f64 = 0.0, in 0.0..=0.001, hint "a measurement of which more was skipped is not valid";
     }
     check RecordingRow::check_set;
 }
@@ -172,6 +174,10 @@ mod tests {
                 "rows.a.seed -1 is outside 0",
             ),
             (format!("{HEAD}{row}network = \"lte\"\n"), "`lte` is not"),
+            (
+                format!("{HEAD}{row}skipped_ratio_max = 0.01\n"),
+                "rows.a.skipped_ratio_max 0.01 is outside 0",
+            ),
             (
                 format!("{HEAD}{row}netwrok = \"short\"\n"),
                 "did you mean `network`",

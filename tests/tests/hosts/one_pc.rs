@@ -150,6 +150,30 @@ fn a_probe_at_both_hosts_counts_what_the_gateways_do_and_replaces_no_capture() {
 }
 
 #[test]
+fn a_probe_that_cannot_capture_ends_the_run_before_it_begins() {
+    let record = open_folder("one-pc-closed");
+    let closed = record.join("closed");
+    fs::create_dir(&closed).unwrap();
+    fs::set_permissions(&closed, Permissions::from_mode(0o555)).unwrap();
+    let probe = ["--probe", closed.to_str().unwrap()];
+    let (_, mut child) = start_with(&record, &["run.duration='2 s'"], &probe);
+    let refused = child.wait_within(LIMIT).unwrap();
+    refused.assert_code(1);
+    for expected in [
+        "Permission denied",
+        "does not capture, so that nothing is run",
+    ] {
+        assert!(refused.stderr.contains(expected), "{}", refused.stderr);
+    }
+    let runs = fs::read_dir(record.path())
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name());
+    let runs: Vec<_> = runs.filter(|name| name != "closed").collect();
+    assert_eq!(runs, Vec::<std::ffi::OsString>::new());
+    assert_nobody_left(&record);
+}
+
+#[test]
 fn a_stop_of_the_one_command_ends_both_hosts_with_their_reports() {
     for (signal, words) in [
         (Signal::SIGINT, Some("Ctrl-C")),

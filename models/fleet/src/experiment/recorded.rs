@@ -65,9 +65,9 @@ impl FleetRow {
     }
 
     fn of(row: RecordedRow<FleetParameters>) -> Result<Self, StudyRefusal> {
-        let (mut tally, mut collided) = (Tally::default(), Vec::new());
+        let mut tally = Tally::default();
         let mut costs = Some(Costs::default());
-        for run in row.runs() {
+        let collided = row.shares(|run| {
             let share = Share {
                 count: run.count(COLLISIONS.name)?,
                 of: run.count(CRITICAL_SECTIONS.name)?,
@@ -75,14 +75,18 @@ impl FleetRow {
             if share.of == 0 && !row.is_replay() {
                 return Err(run.refused("no robot passed a critical section"));
             }
-            tally.section_collisions_count += share.count;
-            tally.sections_passed_count += share.of;
-            tally.overlaps_count += run.count(OVERLAPS.name)?;
-            tally.outside_count += run.count(OUTSIDE.name)?;
-            collided.push(RunShare {
+            Ok(RunShare {
                 share,
                 interval: run.interval(COLLISION_RATIO.name),
-            });
+            })
+        })?;
+        for one in &collided {
+            tally.section_collisions_count += one.share.count;
+            tally.sections_passed_count += one.share.of;
+        }
+        for run in row.runs() {
+            tally.overlaps_count += run.count(OVERLAPS.name)?;
+            tally.outside_count += run.count(OUTSIDE.name)?;
             costs = costs.zip(Costs::of_run(run)).map(|(sum, one)| sum + one);
         }
         let replay = row.replayed().map(Self::of).transpose()?;
@@ -143,6 +147,7 @@ mod tests {
     use hil_core::interval::{Interval, IntervalMethod, Spread};
     use hil_core::recorded_run::{
         DelayBin, LinkOrigin, PublishedNetwork, RecordedCrossing, RecordedLink, RecordedMetric,
+        SkippedTicks,
     };
     use hil_core::study::{Cell, Study, StudyReport, Verdict};
     use hil_stats::metric::Label;
@@ -188,6 +193,7 @@ mod tests {
                 }]),
             },
             score: score.collect(),
+            skipped: SkippedTicks::default(),
             probed: None,
             replays: Ok(Vec::new()),
             doubts: Vec::new(),

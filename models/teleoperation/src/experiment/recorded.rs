@@ -64,20 +64,19 @@ impl MotionLossRow {
         row: RecordedRow<TeleoperationParameters>,
         is_fitted: bool,
     ) -> Result<Self, StudyRefusal> {
-        let mut lost = Vec::new();
-        for run in row.runs() {
+        let lost = row.shares(|run| {
             let [sent, executed] = [run.count(LOOPS_SENT.name)?, run.count(LOOPS_EXECUTED.name)?];
             if sent == 0 && !row.is_replay() {
                 return Err(run.refused("no motion loop was sent"));
             }
-            lost.push(RunShare {
+            Ok(RunShare {
                 share: Share {
                     count: sent.saturating_sub(executed),
                     of: sent,
                 },
                 interval: run.interval(MOTION_LOSS.name),
-            });
-        }
+            })
+        })?;
         // How lost loops would come together, runs without any do not tell.
         let lost = PooledShare::of(&lost, None);
         let replay = row.replayed().map(|row| Self::of(row, is_fitted));
@@ -178,7 +177,7 @@ mod tests {
     use hil_core::case_study::CaseStudy as _;
     use hil_core::interval::{Interval, IntervalMethod, Spread};
     use hil_core::recorded_run::{
-        DelayBin, LinkOrigin, RecordedCrossing, RecordedLink, RecordedMetric,
+        DelayBin, LinkOrigin, RecordedCrossing, RecordedLink, RecordedMetric, SkippedTicks,
     };
     use hil_core::study::{Study as _, StudyReport};
 
@@ -228,6 +227,7 @@ mod tests {
             score: score
                 .map(|(label, metric)| (label.name.to_owned(), metric))
                 .into(),
+            skipped: SkippedTicks::default(),
             probed: None,
             replays: Ok(Vec::new()),
             doubts: Vec::new(),

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use hil_core::interval::{Interval, Spread};
-use hil_platform::text::{grouped, shell_words};
+use hil_platform::text::{grouped, shell_words, shortened};
 use hil_platform::words::counted;
 use hil_present::template::{TemplateError, markdown as document};
 use hil_present::terminal::canvas::{Canvas, Style};
@@ -13,7 +13,7 @@ use hil_present::{Block, Section, Table, Tone, UNAVAILABLE};
 use hil_stats::comparison::Estimate;
 
 use super::conditions::Verdicts;
-use super::harms::HarmDifference;
+use super::harms::{ComparedHarm, HarmDifference};
 use super::origin::{Difference, Differing};
 use super::{ChartKind, ComparedMetric, Comparison, Part, Tested, Verdict};
 use crate::answer::{Hurt, Object, OccasionCount, Unresolved, none_means, with_note};
@@ -23,6 +23,8 @@ const COLUMNS: [&str; 6] = ["metric", "base", "new", "new / base", "95 %", "verd
 /// Differences and channels that are listed unless every metric is asked for.
 const DIFFERENCES_SHOWN: usize = 8;
 const CHANNELS_SHOWN: usize = 12;
+/// Columns of what the emulated links of a side do.
+const LINK_COLUMNS: usize = 130;
 /// Repetitions a side that are asked for.
 const REPETITIONS_MIN: usize = 3;
 
@@ -46,7 +48,7 @@ pub(super) fn brief(comparison: &Comparison, verdicts: &Verdicts, width: usize) 
         channels(comparison),
         end,
     ];
-    text(&sections, comparison, width)
+    text(&sections, comparison, Extent::Brief, width)
 }
 
 /// Every metric, and last the answer.
@@ -57,7 +59,7 @@ pub(super) fn full(comparison: &Comparison, verdicts: &Verdicts, width: usize) -
         methods(comparison),
         judged(verdicts),
     ];
-    text(&sections, comparison, width)
+    text(&sections, comparison, Extent::Full, width)
 }
 
 /// What a comparison asks.
@@ -68,7 +70,7 @@ const fn question(comparison: &Comparison) -> &'static str {
     }
 }
 
-fn text(sections: &[Section], comparison: &Comparison, width: usize) -> String {
+fn text(sections: &[Section], comparison: &Comparison, extent: Extent, width: usize) -> String {
     let mut canvas = Canvas::new(width, Style::Plain);
     for one in sections {
         section(&mut canvas, one);
@@ -81,7 +83,7 @@ fn text(sections: &[Section], comparison: &Comparison, width: usize) -> String {
         Tone::Strong,
         &format!("{}  {}", question(comparison), hurt),
     );
-    section(&mut canvas, &harms(comparison));
+    section(&mut canvas, &harms(comparison, extent));
     canvas.rule(Tone::Faint);
     canvas.finish()
 }
@@ -97,7 +99,7 @@ pub(super) fn markdown(
     let mut answer = Section::new("answer", "", "");
     let hurt = comparison.hurt.words(comparison.object);
     answer.note(Tone::Strong, format!("{} {}", question(comparison), hurt));
-    answer.blocks.extend(harms(comparison).blocks);
+    answer.blocks.extend(harms(comparison, Extent::Full).blocks);
     let sections = [
         answer,
         runs(comparison, Extent::Full),
@@ -156,32 +158,8 @@ fn runs(comparison: &Comparison, extent: Extent) -> Section {
 }
 
 /// What hurt the robot on both sides, by what, whether that is valid, and what it leaves open.
-fn harms(comparison: &Comparison) -> Section {
+fn harms(comparison: &Comparison, extent: Extent) -> Section {
     let mut section = Section::new("harms", "", "");
-    for one in &comparison.harms {
-        section.note(
-            Tone::Strong,
-            with_note(one.base.what.clone(), &one.base.note),
-        );
-        section.fact("base", Tone::Plain, one.base.words());
-        section.fact("new", Tone::Plain, one.new.words());
-        let is_none = one.base.count == Some(0) && one.new.count == Some(0);
-        if let Some(difference) = one.difference.as_ref().filter(|_| !is_none) {
-            section.fact("new less base", Tone::Plain, difference_words(difference));
-        }
-    }
-    if comparison.hurt == Hurt::No {
-        let unhurt = comparison.harms.iter().map(|one| &one.new);
-        for harm in unhurt.filter(|one| one.count == Some(0)) {
-            let means = harm.occasions.iter();
-            for OccasionCount { what, count } in means {
-                section.fact("NO means", Tone::Plain, none_means(what, *count));
-            }
-        }
-    }
-    if let Some(words) = &comparison.gravest_harm {
-        section.fact("gravest harm", Tone::Plain, words);
-    }
     for one in &comparison.measurements {
         let words = match one.runs.as_slice() {
             _ if comparison.measurements.len() == 1 => one.words.clone(),
@@ -193,37 +171,91 @@ fn harms(comparison: &Comparison) -> Section {
         };
         section.fact("measurement", tone, words);
     }
+    section.fact("sample", Tone::Plain, sample(comparison));
+    if let Some(words) = &comparison.gravest_harm {
+        section.fact("gravest harm", Tone::Plain, words);
+    }
+    let is_none = |one: &ComparedHarm| one.base.count == Some(0) && one.new.count == Some(0);
+    let is_folded = |one: &&ComparedHarm| extent == Extent::Brief && is_none(one);
+    let (none, seen): (Vec<_>, Vec<_>) = comparison.harms.iter().partition(is_folded);
+    for one in seen {
+        let (what, base, new) = (&one.base.what, one.base.words(), one.new.words());
+        let difference = one.difference.as_ref().filter(|_| !is_none(one));
+        let difference = difference.map(difference_words);
+        if extent == Extent::Full {
+            section.note(Tone::Strong, with_note(what.clone(), &one.base.note));
+            section.fact("base", Tone::Plain, base);
+            section.fact("new", Tone::Plain, new);
+            if let Some(words) = difference {
+                section.fact("new less base", Tone::Plain, words);
+            }
+            continue;
+        }
+        let mut words = format!("{what}: {base} → {new}");
+        if let Some(difference) = difference {
+            words = format!("{words}, by {difference}");
+        }
+        section.fact("harm", Tone::Plain, words);
+    }
+    if !none.is_empty() {
+        let names: Vec<&str> = none.iter().map(|one| one.base.what.as_str()).collect();
+        section.fact("on neither side", Tone::Plain, names.join("; "));
+    }
+    if comparison.hurt == Hurt::No {
+        let unhurt = comparison.harms.iter().map(|one| &one.new);
+        let unhurt = unhurt.filter(|one| one.count == Some(0));
+        let occasions = unhurt.filter_map(|one| one.occasions.as_ref());
+        let mut means: Vec<String> = occasions
+            .map(|OccasionCount { what, count }| none_means(what, *count))
+            .collect();
+        means.sort();
+        means.dedup();
+        for words in means {
+            section.fact("NO means", Tone::Plain, words);
+        }
+    }
     for (index, words) in left_open(comparison).into_iter().enumerate() {
         let label = if index == 0 { "left open" } else { "" };
         section.fact(label, Tone::Plain, words);
     }
-    tested(&mut section, comparison);
+    links(&mut section, comparison, extent);
     resolve(&mut section, comparison);
     section
 }
 
-/// Over what the runs went, and how long they were.
-fn tested(section: &mut Section, comparison: &Comparison) {
+/// Over what the runs went.
+fn links(section: &mut Section, comparison: &Comparison, extent: Extent) {
     let (base, new) = (&comparison.base_tested, &comparison.new_tested);
-    let links = |of: &Tested| match of.links.as_slice() {
+    let whole = |of: &Tested| match of.links.as_slice() {
         [] => "none".to_owned(),
         all => all.join(" or "),
     };
+    let cut = |of: &Tested| shortened(&whole(of), LINK_COLUMNS);
+    // Where the cut would make them alike they are not cut.
+    let is_cut = extent == Extent::Brief && (base.links == new.links || cut(base) != cut(new));
+    let links = |of: &Tested| if is_cut { cut(of) } else { whole(of) };
     if base.links == new.links {
         section.fact("link", Tone::Plain, links(base));
     } else {
         section.fact("link of the base", Tone::Plain, links(base));
         section.fact("link of the new", Tone::Plain, links(new));
     }
-    let sample = |runs: &[PathBuf], of: &Tested| {
+}
+
+/// How long the runs were.
+fn sample(comparison: &Comparison) -> String {
+    let of_side = |runs: &[PathBuf], of: &Tested| {
         let length = format!("{:.1}{JOINT}s", of.duration_s);
         match runs.len() as u64 {
             1 => format!("1 run of {length}"),
             count => format!("{} of {length} together", counted(count, "run")),
         }
     };
-    let (base, new) = (sample(&comparison.base, base), sample(&comparison.new, new));
-    section.fact("sample", Tone::Plain, format!("base {base}, new {new}"));
+    format!(
+        "base {}, new {}",
+        of_side(&comparison.base, &comparison.base_tested),
+        of_side(&comparison.new, &comparison.new_tested)
+    )
 }
 
 /// What would make an answer of a sample that is too small.

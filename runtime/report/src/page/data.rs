@@ -79,7 +79,7 @@ pub(crate) struct AnswerView {
     pub(crate) reason: Option<String>,
     /// What hurt the robot, and what might have.
     pub(crate) harms: Vec<Field>,
-    /// Whether the measurement is valid, what the network did, how large the sample is, and the emulated links.
+    /// Whether the measurement is valid, how large the sample is, what the network did, and the emulated links.
     pub(crate) badges: Vec<Field>,
 }
 

@@ -189,7 +189,7 @@ fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
         value: plain(one.value),
         ..one
     };
-    let facts = AnswerFacts::of(summary, assessment, &answer, usize::MAX);
+    let facts = AnswerFacts::of(summary, assessment, &answer, None);
     AnswerView {
         question: answer.question(),
         answer: Verdict {
@@ -199,9 +199,10 @@ fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
         },
         reason: answer.reason().map(plain),
         harms: facts.harms.into_iter().map(field).collect(),
-        badges: [facts.measurement]
+        badges: [facts.measurement, facts.sample]
             .into_iter()
             .chain(facts.rest)
+            .chain(facts.links)
             .map(field)
             .collect(),
     }

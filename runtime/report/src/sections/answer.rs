@@ -10,7 +10,7 @@ use hil_present::{Field, Tone};
 
 use super::demand;
 use super::events::gravest_harm;
-use crate::answer::{Answer, HarmCount, Hurt, OCCASIONS_MIN, with_note};
+use crate::answer::{Answer, Hurt, OCCASIONS_MIN, with_note};
 use crate::assessment::Assessment;
 use crate::summary::{LinkKind, RunSummary};
 use hil_core::case_study::Severity;
@@ -20,19 +20,23 @@ use hil_core::case_study::Severity;
 pub(crate) struct AnswerFacts {
     /// Whether the measurement is valid.
     pub(crate) measurement: Field,
+    /// How large the sample is.
+    pub(crate) sample: Field,
     /// What hurt the robot, and what might have.
     pub(crate) harms: Vec<Field>,
-    /// What the network did, what the case counts beside harm, and how large the sample is.
+    /// What the network did, and what the case counts beside harm.
     pub(crate) rest: Vec<Field>,
+    /// What the emulated links do.
+    pub(crate) links: Option<Field>,
 }
 
 impl AnswerFacts {
-    /// Of a run; of its harms `harms_shown`, those that happened first if there are more.
+    /// Of a run; of its harms and figures `shown_max` each, and of harms that did not happen only the names, unless all is wanted.
     pub(crate) fn of(
         summary: &RunSummary,
         assessment: &Assessment,
         answer: &Answer,
-        harms_shown: usize,
+        shown_max: Option<usize>,
     ) -> Self {
         let (tone, validity) = answer.measurement_words(&assessment.network);
         let mut harms = Vec::new();
@@ -42,9 +46,13 @@ impl AnswerFacts {
             harms.push(Field::new("gravest harm", harm));
             harms.push(Field::new("network before it", cause));
         }
-        let mut counts: Vec<&HarmCount> = summary.harms.iter().collect();
-        if counts.len() > harms_shown {
-            counts.sort_by_key(|harm| harm.count == Some(0));
+        let harms_shown = shown_max.unwrap_or(usize::MAX);
+        let is_folded = |count: Option<u64>| count == Some(0) && shown_max.is_some();
+        let all = summary.harms.iter();
+        let (mut none, mut counts): (Vec<_>, Vec<_>) = all.partition(|harm| is_folded(harm.count));
+        // A single one has room to say of how many, and what it counts.
+        if none.len() == 1 {
+            counts.append(&mut none);
         }
         let shown = counts.iter().take(harms_shown);
         harms.extend(shown.map(|harm| Field::new(&harm.what, with_note(harm.words(), &harm.note))));
@@ -57,8 +65,12 @@ impl AnswerFacts {
             let words = "answers that would have come in time but for the network";
             harms.push(Field::new("counted as harm", words));
         }
+        if !none.is_empty() {
+            let names: Vec<&str> = none.iter().map(|harm| harm.what.as_str()).collect();
+            harms.push(Field::new("none seen", names.join("; ")));
+        }
         if answer.hurt == Hurt::No {
-            harms.extend(near_misses(summary).map(|words| Field::new("near misses", words)));
+            harms.extend(hazards(summary).map(|words| Field::new("hazards", words)));
             let means = answer.no_means();
             harms.extend(means.map(|words| Field::new("NO means", words)));
         }
@@ -83,13 +95,13 @@ impl AnswerFacts {
             all if !all.is_empty() && links.is_none() => format!(" over {}", all.join(" and ")),
             _ => String::new(),
         };
-        rest.extend(links.map(|words| Field::new("emulated link", words)));
-        let words = format!("{}{note}", answer.sample_words(&over));
-        rest.push(Field::new("sample", words));
+        let sample = format!("{}{note}", answer.sample_words(&over));
         Self {
             measurement: Field::toned("measurement", tone, validity),
+            sample: Field::new("sample", sample),
             harms,
             rest,
+            links: links.map(|words| Field::new("emulated link", words)),
         }
     }
 }
@@ -118,7 +130,7 @@ pub(crate) fn transports(summary: &RunSummary) -> Vec<&'static str> {
 }
 
 /// Hazards of a robot that was not hurt: how many, and the first; `None` without a robot.
-fn near_misses(summary: &RunSummary) -> Option<String> {
+fn hazards(summary: &RunSummary) -> Option<String> {
     if summary.run.case.is_empty() {
         return None;
     }
@@ -128,7 +140,7 @@ fn near_misses(summary: &RunSummary) -> Option<String> {
     Some(first.map_or_else(
         || "none".to_owned(),
         |first| {
-            let count = counted(all.count_of(Severity::Hazard), "hazard");
+            let count = grouped(all.count_of(Severity::Hazard));
             format!("{count}; first: {}", first.what)
         },
     ))

@@ -10,7 +10,7 @@ use std::str::FromStr;
 use hil_account::network::Metric;
 use hil_core::recorded_run::{
     DelayBin, Doubt, LinkOrigin, PublishedNetwork, RecordedCrossing, RecordedLink, RecordedMetric,
-    RecordedRun,
+    RecordedRun, SkippedTicks,
 };
 use serde_json::Value;
 
@@ -26,11 +26,13 @@ use crate::summary::{
 
 /// Runs of the command line: a folder, or those that a `*` in its last part stands for, and the published network
 /// that they stand for.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct RunArgument {
     network: Option<PublishedNetwork>,
     row: Option<String>,
     folder: String,
+    /// Its row allows so large a share of skipped ticks.
+    skipped_ratio_max: f64,
 }
 
 impl FromStr for RunArgument {
@@ -44,6 +46,7 @@ impl FromStr for RunArgument {
                 network: None,
                 row: None,
                 folder: text.to_owned(),
+                skipped_ratio_max: 0.0,
             });
         };
         let mut networks = PublishedNetwork::ALL.into_iter();
@@ -58,6 +61,7 @@ impl FromStr for RunArgument {
             network,
             row: None,
             folder: folder.to_owned(),
+            skipped_ratio_max: 0.0,
         })
     }
 }
@@ -78,6 +82,15 @@ impl RunArgument {
             network,
             row: network.is_none().then(|| name.to_owned()),
             folder: folder.display().to_string(),
+            skipped_ratio_max: 0.0,
+        }
+    }
+
+    /// The same, of which this share of the ticks may have been skipped.
+    pub(super) fn allow(self, skipped_ratio_max: f64) -> Self {
+        Self {
+            skipped_ratio_max,
+            ..self
         }
     }
 
@@ -159,10 +172,7 @@ pub(super) fn read(
     }
     let recorded = runs.into_iter().map(|(run, argument)| {
         let folder = run.folder.display().to_string();
-        let run = recorded(run, argument.network, case);
-        let run = run.map_err(|problem| format!("{folder}: {problem}"))?;
-        let row = argument.row.clone();
-        Ok(RecordedRun { row, ..run })
+        recorded(run, argument, case).map_err(|problem| format!("{folder}: {problem}"))
     });
     recorded.collect()
 }
@@ -184,7 +194,7 @@ fn is_same_run(one: &ComparedRun, other: &ComparedRun) -> bool {
 /// Why it can be no row of them.
 pub(super) fn recorded(
     run: ComparedRun,
-    network: Option<PublishedNetwork>,
+    argument: &RunArgument,
     case: &str,
 ) -> Result<RecordedRun<Value>, String> {
     let ComparedRun {
@@ -218,22 +228,24 @@ pub(super) fn recorded(
         .map_err(|error| error.to_string())?
         .map(|scores| scores.iter().map(|score| by_name(score)).collect());
     let probed = probed::read(&folder).map_err(|error| format!("{}: {error}", probed::FILE))?;
+    let skipped = skipped(&summary);
     Ok(RecordedRun {
         folder: folder.display().to_string(),
         name: match topology.get("name").and_then(Value::as_str) {
             Some(name) => name.to_owned(),
             None => facts.name.clone(),
         },
-        network,
-        row: None,
+        network: argument.network,
+        row: argument.row.clone(),
         link: link(&summary, &crossing),
         seed: facts.seed,
         parameters,
+        skipped,
         crossing: crossing_of(&summary, &crossing),
         probed,
         score: by_name(&summary.score),
         replays,
-        doubts: doubts(&summary),
+        doubts: doubts(&summary, skipped, argument.skipped_ratio_max),
     })
 }
 
@@ -315,8 +327,20 @@ const fn missing<T>(metric: &Metric<T>) -> Option<&String> {
     }
 }
 
-/// What speaks against holding the run against the paper.
-fn doubts(summary: &RunSummary) -> Vec<Doubt> {
+/// The ticks of all its processes.
+fn skipped(summary: &RunSummary) -> SkippedTicks {
+    let processes = summary.processes.iter();
+    let sum =
+        |of: fn(&ProcessSummary) -> Option<u64>| -> u64 { processes.clone().filter_map(of).sum() };
+    let skipped_count = sum(|process| process.skipped_tick_count);
+    SkippedTicks {
+        skipped_count,
+        due_count: skipped_count + sum(|process| process.tick_count),
+    }
+}
+
+/// What speaks against holding the run against the paper, of whose ticks so large a share may have been skipped.
+fn doubts(summary: &RunSummary, skipped: SkippedTicks, skipped_ratio_max: f64) -> Vec<Doubt> {
     let mut found = Vec::new();
     if summary.run.outcome == Outcome::Stopped {
         found.push(Doubt::Stopped {
@@ -327,18 +351,11 @@ fn doubts(summary: &RunSummary) -> Vec<Doubt> {
     let answer = Answer::of(summary, &assessment);
     let measurement = answer.measurement;
     let is_valid = measurement.is_valid == Some(true) && measurement.uncounted_start_count == 0;
-    let processes = summary.processes.iter();
-    let sum =
-        |of: fn(&ProcessSummary) -> Option<u64>| -> u64 { processes.clone().filter_map(of).sum() };
-    let skipped_count = sum(|process| process.skipped_tick_count);
     if !is_valid {
         let (_, measurement) = answer.measurement_words(&assessment.network);
         found.push(Doubt::NotValid { measurement });
-    } else if skipped_count > 0 {
-        found.push(Doubt::SkippedTicks {
-            skipped_count,
-            due_count: skipped_count + sum(|process| process.tick_count),
-        });
+    } else if skipped.is_above(skipped_ratio_max) {
+        found.push(Doubt::SkippedTicks(skipped));
     }
     if is_score_incomplete(summary) {
         found.push(Doubt::ScoreIncomplete);
@@ -378,9 +395,18 @@ mod tests {
         }
     }
 
+    fn argument(network: Option<PublishedNetwork>) -> RunArgument {
+        RunArgument {
+            network,
+            row: None,
+            folder: "runs/eth-1".to_owned(),
+            skipped_ratio_max: 0.0,
+        }
+    }
+
     fn read_one(change: impl FnOnce(&mut RunSummary)) -> Result<RecordedRun<Value>, String> {
         let ethernet = Some(PublishedNetwork::Ethernet);
-        recorded(run(change), ethernet, "teleoperation")
+        recorded(run(change), &argument(ethernet), "teleoperation")
     }
 
     #[test]
@@ -389,9 +415,8 @@ mod tests {
         let of = |network, folder: &str| {
             let folder = folder.to_owned();
             Ok(RunArgument {
-                network,
-                row: None,
                 folder,
+                ..argument(network)
             })
         };
         assert_eq!(parsed("runs/a=b"), of(None, "runs/a=b"));
@@ -512,7 +537,7 @@ mod tests {
         assert_eq!(local, "no channel went over a network, or a model of one");
         let mut bare = run(|_| {});
         bare.topology = Value::Null;
-        let error = recorded(bare, None, "teleoperation").unwrap_err();
+        let error = recorded(bare, &argument(None), "teleoperation").unwrap_err();
         assert!(error.contains("case.parameters"), "{error}");
     }
 
@@ -520,14 +545,23 @@ mod tests {
     fn a_sound_run_has_no_doubts_and_what_is_wrong_is_named() {
         let found = |change: fn(&mut RunSummary)| read_one(change).unwrap().doubts;
         assert_eq!(found(|_| {}), []);
-        assert_eq!(
-            found(|one| one.processes[0].skipped_tick_count = Some(2)),
-            [Doubt::SkippedTicks {
-                skipped_count: 2,
-                due_count: 10_002,
-            }]
-        );
-        let overran = found(|one| one.processes[0].skipped_tick_count = Some(500));
+        let two = |one: &mut RunSummary| one.processes[0].skipped_tick_count = Some(2);
+        let skipped = SkippedTicks {
+            skipped_count: 2,
+            due_count: 10_002,
+        };
+        assert_eq!(found(two), [Doubt::SkippedTicks(skipped)]);
+        for (allowed, is_sound) in [(0.000_1, false), (0.000_2, true)] {
+            let allowing = argument(None).allow(allowed);
+            let one = recorded(run(two), &allowing, "teleoperation").unwrap();
+            assert_eq!((one.is_sound(), one.skipped), (is_sound, skipped));
+        }
+        // No row allows what makes a measurement invalid.
+        let overran = |one: &mut RunSummary| one.processes[0].skipped_tick_count = Some(500);
+        let allowing = argument(None).allow(1.0);
+        let overran = recorded(run(overran), &allowing, "teleoperation")
+            .unwrap()
+            .doubts;
         let [Doubt::NotValid { measurement }] = overran.as_slice() else {
             panic!("{overran:?}");
         };

@@ -15,17 +15,20 @@ const LABEL_WIDTH_MAX: usize = 36;
 /// How much of it is shown.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct AnswerExtent {
-    /// Ways in which the robot can be hurt.
-    pub(super) harms: usize,
+    /// Ways in which the robot was hurt, and figures of the case; `None` for all, and those in which it was not.
+    pub(super) harms: Option<usize>,
     /// Lines of what stands beside a label.
     pub(super) lines: usize,
+    /// Lines of what the emulated links do.
+    pub(super) link_lines: usize,
 }
 
 impl AnswerExtent {
     /// All there is.
     pub(super) const WHOLE: Self = Self {
-        harms: usize::MAX,
+        harms: None,
         lines: 20,
+        link_lines: 20,
     };
 }
 
@@ -52,15 +55,17 @@ pub(super) fn answer(
         canvas.paragraph(0, answer.tone(), &words);
     }
     let facts = AnswerFacts::of(summary, assessment, &answer, extent.harms);
-    let all: Vec<_> = [facts.measurement]
+    let all: Vec<_> = [facts.measurement, facts.sample]
         .into_iter()
         .chain(facts.harms)
         .chain(facts.rest)
+        .map(|field| (field, extent.lines))
+        .chain(facts.links.map(|links| (links, extent.link_lines)))
         .collect();
-    let widest = all.iter().map(|one| columns(&one.label) + 2).max();
+    let widest = all.iter().map(|(one, _)| columns(&one.label) + 2).max();
     let label_width = widest.unwrap_or(0).clamp(LABEL_WIDTH_MIN, LABEL_WIDTH_MAX);
-    let room = extent.lines * (canvas.width() - label_width) - 30;
-    for one in &all {
+    for (one, lines) in &all {
+        let room = lines * (canvas.width() - label_width) - 30;
         let value = shortened(&one.value, room);
         canvas.field_of(label_width, &one.label, one.tone, &value);
     }

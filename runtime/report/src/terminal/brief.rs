@@ -45,7 +45,11 @@ const EXTENTS: [Extent; 4] = [
         flows: 6,
         deadlines: 6,
         robot_rows: 2,
-        answer: AnswerExtent { harms: 6, lines: 5 },
+        answer: AnswerExtent {
+            harms: Some(6),
+            lines: 5,
+            link_lines: 2,
+        },
     },
     Extent {
         causes: 3,
@@ -53,7 +57,11 @@ const EXTENTS: [Extent; 4] = [
         flows: 4,
         deadlines: 4,
         robot_rows: 1,
-        answer: AnswerExtent { harms: 6, lines: 4 },
+        answer: AnswerExtent {
+            harms: Some(6),
+            lines: 4,
+            link_lines: 2,
+        },
     },
     Extent {
         causes: 2,
@@ -61,7 +69,11 @@ const EXTENTS: [Extent; 4] = [
         flows: 3,
         deadlines: 3,
         robot_rows: 1,
-        answer: AnswerExtent { harms: 4, lines: 3 },
+        answer: AnswerExtent {
+            harms: Some(4),
+            lines: 3,
+            link_lines: 2,
+        },
     },
     Extent {
         causes: 1,
@@ -69,7 +81,11 @@ const EXTENTS: [Extent; 4] = [
         flows: 2,
         deadlines: 2,
         robot_rows: 1,
-        answer: AnswerExtent { harms: 2, lines: 2 },
+        answer: AnswerExtent {
+            harms: Some(2),
+            lines: 2,
+            link_lines: 2,
+        },
     },
 ];
 

@@ -195,6 +195,25 @@ fn what_the_robot_did_to_itself_is_not_the_network() {
 }
 
 #[test]
+fn harms_that_did_not_happen_are_named_in_one_line_and_counted_in_the_full_report() {
+    let mut two = run(lost_loops(Some(0), 0, 600));
+    count_all(&mut two);
+    two.harms.push(HarmCount {
+        what: "collisions".to_owned(),
+        ..lost_loops(Some(0), 0, 700)
+    });
+    let page = brief(&two, 100, Style::Plain);
+    assert!(page.contains("none seen"), "{page}");
+    assert!(page.contains("motion loops lost; collisions"), "{page}");
+    assert!(!page.contains("0 of 700"), "{page}");
+    let whole = render(&two, 100, Style::Plain);
+    assert!(!whole.contains("none seen"), "{whole}");
+    for counted in ["0 of 600 motion loops sent", "0 of 700 motion loops sent"] {
+        assert!(whole.contains(counted), "{whole}");
+    }
+}
+
+#[test]
 fn a_sample_that_is_too_small_shows_no_absence_of_harm() {
     let small = run(lost_loops(Some(0), 0, 9));
     let Hurt::NotResolvable {
@@ -209,7 +228,8 @@ fn a_sample_that_is_too_small_shows_no_absence_of_harm() {
     count_all(&mut enough);
     let page = brief(&enough, 100, Style::Plain);
     let page = page.split_whitespace().collect::<Vec<_>>().join(" ");
-    let means = "NO means no such harm in 10 motion loops sent: 300 per 1,000 or more are excluded (95 %); a larger sample excludes lower rates";
+    let means =
+        "NO means none in 10 motion loops sent excludes a rate of 300 per 1,000 or more (95 %)";
     assert!(page.contains(means), "{page}");
     let enough = answer(&enough);
     assert_eq!((enough.hurt.clone(), enough.tone()), (Hurt::No, Tone::Good));

@@ -123,6 +123,8 @@ struct Row<'a> {
     sample: RowSample,
     target: Target,
     case: &'static str,
+    /// A run that skipped a larger share of its ticks is refused.
+    skipped_ratio_max: f64,
     /// A passive probe captures at these hosts; nowhere if there are none.
     probed: Vec<String>,
     folder: RowFolder,
@@ -139,23 +141,29 @@ impl Row<'_> {
         RecordingError::Row { row, problem }
     }
 
+    /// A run of it in `folder`, as one of the command line.
+    fn argument(&self, folder: &Path) -> RunArgument {
+        RunArgument::of(self.name, self.network, folder).allow(self.skipped_ratio_max)
+    }
+
+    fn recorded(&self, run: ComparedRun) -> Result<RecordedRun<Value>, String> {
+        let argument = self.argument(&run.folder);
+        recorded(run, &argument, self.case)
+    }
+
     /// What `run` counted, of which a trial may be too short to count anything.
     ///
     /// # Errors
     /// Why it may not be part of the row.
     fn judge(&self, run: ComparedRun, part: Part) -> Result<u64, String> {
-        let run = recorded(run, self.network, self.case)?;
+        let run = self.recorded(run)?;
         let doubts: Vec<_> = run.doubts.iter().map(ToString::to_string).collect();
         if !doubts.is_empty() {
             return Err(doubts.join("; "));
         }
         if let Part::Trial(2..) = part {
             let one = ComparedRun::read(&self.folder.path(Part::Trial(1)));
-            let one = recorded(
-                one.map_err(|error| error.to_string())?,
-                self.network,
-                self.case,
-            )?;
+            let one = self.recorded(one.map_err(|error| error.to_string())?)?;
             if let Some(why) = overload(one, run.clone()) {
                 return Err(why);
             }
@@ -218,7 +226,12 @@ impl Row<'_> {
             ));
         }
         let count = self.judge(run, part);
-        count.map_err(|why| format!("{}: {why}", folder.display()))
+        count.map_err(|why| {
+            format!(
+                "{}: {why}, which the row does not allow; give the file another `folder`, or remove this one",
+                folder.display()
+            )
+        })
     }
 
     /// In what the topology of a kept run differs from the row's, but for what each run has for itself, in words.
@@ -404,6 +417,7 @@ fn rows<'a>(
                 is_tried,
             },
             case,
+            skipped_ratio_max: row.skipped_ratio_max,
             probed,
             folder: RowFolder::new(root.join(name)),
         })
@@ -472,9 +486,7 @@ pub fn record(
             .runs
             .keys()
             .map(|seed| row.folder.path(Part::Run(*seed)));
-        recorded
-            .runs
-            .extend(runs.map(|path| RunArgument::of(row.name, row.network, &path)));
+        recorded.runs.extend(runs.map(|path| row.argument(&path)));
     }
     Ok(recorded)
 }
@@ -727,7 +739,9 @@ impl RunMaker<'_> {
 mod tests {
     use super::*;
 
-    use hil_core::recorded_run::{DelayBin, LinkOrigin, RecordedCrossing, RecordedLink};
+    use hil_core::recorded_run::{
+        DelayBin, LinkOrigin, RecordedCrossing, RecordedLink, SkippedTicks,
+    };
     use hil_shuttle::Shuttle;
 
     const FILE: &str = concat!(
@@ -765,6 +779,7 @@ mod tests {
                 is_tried: true,
             },
             case: "shuttle",
+            skipped_ratio_max: 0.0,
             probed: Vec::new(),
             folder: RowFolder::new(PathBuf::from("runs/a")),
         }
@@ -813,6 +828,7 @@ mod tests {
                 }]),
             },
             score: BTreeMap::new(),
+            skipped: SkippedTicks::default(),
             probed: None,
             replays: Ok(Vec::new()),
             doubts: Vec::new(),
