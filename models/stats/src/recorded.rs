@@ -289,23 +289,23 @@ impl<P> RecordedRow<P> {
         of: impl Fn(&RecordedRun<P>) -> Result<RunShare, E>,
     ) -> Result<Vec<RunShare>, E> {
         let of_trace = |runs: &[RecordedRun<P>]| {
-            let mut runs = runs.iter().map(&of);
-            let first = runs.next().expect("a chunk is not empty")?;
-            runs.try_fold(first, |sum, one| {
-                let one = one?.share;
-                Ok(RunShare {
+            runs.iter().try_fold(None, |sum: Option<RunShare>, run| {
+                let one = of(run)?;
+                let sum = sum.map(|sum| RunShare {
                     share: Share {
-                        count: sum.share.count + one.count,
-                        of: sum.share.of + one.of,
+                        count: sum.share.count + one.share.count,
+                        of: sum.share.of + one.share.of,
                     },
                     ..sum
-                })
+                });
+                Ok(Some(sum.unwrap_or(one)))
             })
         };
-        let traces = self
-            .runs
-            .chunk_by(|one, other| self.is_replay && one.folder == other.folder);
-        traces.map(of_trace).collect()
+        let is_of_one = |one: &RecordedRun<P>, other: &RecordedRun<P>| {
+            self.is_replay && one.folder == other.folder
+        };
+        let traces = self.runs.chunk_by(is_of_one).map(of_trace);
+        traces.filter_map(Result::transpose).collect()
     }
 
     /// True of what happened in replays.

@@ -158,7 +158,7 @@ fn a_probe_that_cannot_capture_ends_the_run_before_it_begins() {
     let probe = ["--probe", closed.to_str().unwrap()];
     let (_, mut child) = start_with(&record, &["run.duration='2 s'"], &probe);
     let refused = child.wait_within(LIMIT).unwrap();
-    refused.assert_code(1);
+    refused.assert_code(2);
     for expected in [
         "Permission denied",
         "does not capture, so that nothing is run",

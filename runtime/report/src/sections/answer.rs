@@ -49,10 +49,11 @@ impl AnswerFacts {
         let harms_shown = shown_max.unwrap_or(usize::MAX);
         let is_folded = |count: Option<u64>| count == Some(0) && shown_max.is_some();
         let all = summary.harms.iter();
-        let (mut none, mut counts): (Vec<_>, Vec<_>) = all.partition(|harm| is_folded(harm.count));
+        let (mut unseen, mut counts): (Vec<_>, Vec<_>) =
+            all.partition(|harm| is_folded(harm.count));
         // A single one has room to say of how many, and what it counts.
-        if none.len() == 1 {
-            counts.append(&mut none);
+        if unseen.len() == 1 {
+            counts.append(&mut unseen);
         }
         let shown = counts.iter().take(harms_shown);
         harms.extend(shown.map(|harm| Field::new(&harm.what, with_note(harm.words(), &harm.note))));
@@ -65,8 +66,8 @@ impl AnswerFacts {
             let words = "answers that would have come in time but for the network";
             harms.push(Field::new("counted as harm", words));
         }
-        if !none.is_empty() {
-            let names: Vec<&str> = none.iter().map(|harm| harm.what.as_str()).collect();
+        if !unseen.is_empty() {
+            let names: Vec<&str> = unseen.iter().map(|harm| harm.what.as_str()).collect();
             harms.push(Field::new("none seen", names.join("; ")));
         }
         if answer.hurt == Hurt::No {
