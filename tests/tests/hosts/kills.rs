@@ -6,6 +6,7 @@ use std::time::Duration;
 use std::{fs, thread};
 
 use hil_account::{InterruptionMetrics, MessageFate};
+use hil_platform::text::grouped;
 use hil_report::assessment::{Assessment, NetworkVerdict};
 use hil_report::summary::{Outcome, RunEvent, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
@@ -189,7 +190,7 @@ fn a_receiver_that_stood_still_is_no_network_result() {
         );
         let warnings = assessment.warnings.join("\n");
         assert!(
-            lost == 0 || warnings.contains(&format!("lost {lost} messages so")),
+            lost == 0 || warnings.contains(&format!("lost {} messages so", grouped(lost))),
             "{warnings}"
         );
     }
