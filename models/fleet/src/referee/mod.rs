@@ -36,7 +36,7 @@ use hil_core::time::Instant;
 /// From scan to scan.
 pub const SCAN_PERIOD: Duration = Duration::from_millis(30);
 
-/// A robot that stands for so many scans has stopped. The stepped tracker stands between its ticks: with ticks of more than
+/// A robot that stands for so many scans before its goal has stopped. The stepped tracker stands between its ticks: with ticks of more than
 /// half of this, what is no stop may count as one.
 pub(crate) const STOP_SCANS: u32 = 10;
 
@@ -465,9 +465,11 @@ impl Track {
         has_passed
     }
 
-    /// After a look: it has now stood still on its mission for [`STOP_SCANS`] scans.
+    /// After a look: it has now stood still on its mission for [`STOP_SCANS`] scans. At its goal it has not stopped: the
+    /// stepped tracker stands there until its speed is gone, and ends its mission then.
     fn has_stopped(&mut self) -> bool {
-        if self.has_moved || !self.is_driving {
+        let is_at_goal = (self.path.as_ref()).is_some_and(|path| self.index >= path.last_index());
+        if self.has_moved || !self.is_driving || is_at_goal {
             self.still_count = 0;
         } else {
             self.still_count = self.still_count.saturating_add(1);
@@ -544,7 +546,8 @@ hil_core::counts! {
         missions_timed_count: u64;
         /// How much longer these took than drives without a stop, all together, seconds.
         mission_delay_s: f64;
-        /// Times a robot stood still on its mission for [`STOP_SCANS`] scans or longer; before it set out too.
+        /// Times a robot stood still on its mission for [`STOP_SCANS`] scans or longer; before it set out too, and not at
+        /// its goal.
         stops_count: u64;
         /// Robots put at their goal to clear a stuck fleet.
         replaced_count: u64;
