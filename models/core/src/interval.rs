@@ -73,7 +73,7 @@ impl Interval {
 /// Why a sample has no interval: it is worth too few independent observations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
 #[error(
-    "no interval: as good as {effective} independent one{}, {needed} needed",
+    "no interval: {effective} independent value{}, {needed} needed",
     if *.effective == 1 { "" } else { "s" }
 )]
 pub struct TooSmall {

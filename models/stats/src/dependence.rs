@@ -703,7 +703,7 @@ mod tests {
         let few = Batches::of_runs(40, [(3, 1), (9, 1)]).share_interval();
         assert_eq!(
             few.to_string(),
-            "no interval: as good as 40 independent ones, 64 needed"
+            "no interval: 40 independent values, 64 needed"
         );
     }
 

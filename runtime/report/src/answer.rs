@@ -113,7 +113,7 @@ impl HarmCount {
                     Some(Spread::Unknown(_)) if count == 0 => String::new(),
                     // Too few, however independent: their number stands before it.
                     Some(Spread::Unknown(why)) if why.effective >= occasions.count => {
-                        format!(" [no interval of fewer than {}]", grouped(why.needed))
+                        format!(" [an interval takes {}]", grouped(why.needed))
                     }
                     Some(Spread::Unknown(why)) => format!(" [{why}]"),
                     Some(Spread::Known(Interval { low, high, .. })) => {
@@ -463,7 +463,7 @@ pub(crate) fn none_means(what: &str, count: u64) -> String {
     let most = upper_bound(-1e3 * (1.0 - CONFIDENCE).ln() / count.max(1) as f64);
     let percent = 100.0 * CONFIDENCE;
     format!(
-        "none in {} {what} excludes a rate of {most} per 1,000 or more ({percent:.0}{JOINT}%)",
+        "none in {} {what}: a rate of up to {most} per 1,000 remains possible ({percent:.0}{JOINT}%)",
         grouped(count)
     )
 }
@@ -710,7 +710,9 @@ fn subject(summary: &RunSummary, network: &NetworkVerdict) -> Subject {
 /// What there is in place of a measurement.
 const fn unmeasured_words(network: &NetworkVerdict) -> &'static str {
     match network {
-        NetworkVerdict::VirtualTime => "none: virtual time tells of link models, not of a network",
+        NetworkVerdict::VirtualTime => {
+            "none: a simulation, whose answer is of its link models and of no real network"
+        }
         NetworkVerdict::RunFailed => "none: the run failed",
         NetworkVerdict::HostUnknown => "unknown: nothing that ran tells whether the hosts kept up",
         _ => "none: nothing went over a network",

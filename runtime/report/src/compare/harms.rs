@@ -418,7 +418,7 @@ mod tests {
         let of = |base: u64, new: u64| {
             compared(&[run(Some(base), 17)], &[run(Some(new), 17)]).words(Object::Robot)
         };
-        let hurt = "CANNOT TELL: the difference of motion loops lost has no interval: as good as 17 independent ones, 64 needed";
+        let hurt = "CANNOT TELL: the difference of motion loops lost has no interval: 17 independent values, 64 needed";
         assert_eq!(of(0, 11), hurt);
         let unhurt = "CANNOT TELL: the sample is too small for a NO (motion loops sent in a new run where a side has one: 17, needed: 64)";
         assert_eq!(of(0, 0), unhurt);

@@ -47,9 +47,7 @@ impl fmt::Display for Differing {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Key(key) => write!(formatter, "topology {key}"),
-            Self::Topology => {
-                formatter.write_str("topology, of which not every folder has the keys")
-            }
+            Self::Topology => formatter.write_str("topology (not every folder has its keys)"),
             Self::Seed => formatter.write_str("seed"),
             Self::Links => formatter.write_str("links"),
             Self::Fact(what) => formatter.write_str(what),

@@ -208,12 +208,12 @@ fn answer_view(summary: &RunSummary, assessment: &Assessment) -> AnswerView {
     }
 }
 
-/// True when the 99th percentile of a channel is more than its largest value: that of two messages is
-/// no figure to see first.
-fn has_a_hundredth(channel: &Section) -> bool {
+/// True when a channel has a hundred messages of a `kind`: the 99th percentile of two is only their larger one, and one of two lost
+/// is no figure to see first.
+fn has_a_hundred(channel: &Section, kind: &str) -> bool {
     let metrics = channel.metrics();
-    let delivered = metrics.iter().find(|(_, one)| one.name == "delivered");
-    delivered.and_then(|(_, one)| one.value).unwrap_or(0.0) >= 100.0
+    let count = metrics.iter().find(|(_, one)| one.name == kind);
+    count.and_then(|(_, one)| one.value).unwrap_or(0.0) >= 100.0
 }
 
 /// Figures of which the channel with the largest is shown first, and what they are called.
@@ -238,10 +238,11 @@ fn headline(sections: &[Section], wanted: &[String]) -> Vec<Metric> {
     }
     let channels = of("channels").map_or(&[][..], |section| &section.children);
     for (name, words) in WORST {
-        let is_quantile = name != "loss_ratio";
-        let told = channels
-            .iter()
-            .filter(|one| !is_quantile || has_a_hundredth(one));
+        let kind = match name {
+            "loss_ratio" => "published",
+            _ => "delivered",
+        };
+        let told = channels.iter().filter(|one| has_a_hundred(one, kind));
         let all = told.flat_map(Section::metrics);
         let all = all.filter(|(_, one)| one.name == name && one.value.is_some());
         let value = |one: &Metric| one.value.unwrap_or(f64::NEG_INFINITY);
@@ -261,20 +262,26 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_worst_delay_to_see_first_rests_on_a_hundred_messages() {
-        let channel = |name: &str, delivered, p99| {
+    fn the_worst_of_the_network_to_see_first_rests_on_a_hundred_messages() {
+        let channel = |name: &str, count, p99| {
             let mut section = Section::new("channel", name, "");
             name.clone_into(&mut section.subject);
-            section.metric(Metric::new("delivered", "delivered", "1", delivered));
+            section.metric(Metric::new("published", "published", "1", count));
+            section.metric(Metric::new("delivered", "delivered", "1", count));
+            section.metric(Metric::new("loss_ratio", "lost", "1", 10.0 * p99));
             section.metric(Metric::new("p99", "p99", "s", p99));
             section
         };
         let mut all = Section::new("channels", "Channels", "");
         all.children = vec![channel("often", 100.0, 1e-3), channel("twice", 2.0, 5e-3)];
-        let [first] = headline(std::slice::from_ref(&all), &[])
+        let [loss, delay] = headline(std::slice::from_ref(&all), &[])
             .try_into()
             .unwrap();
-        assert_eq!(first.label, "largest p99: often");
+        assert_eq!(
+            loss.label,
+            "largest loss by the network, of what it was given: often"
+        );
+        assert_eq!(delay.label, "largest p99: often");
         all.children.remove(0);
         assert!(headline(&[all], &[]).is_empty());
     }

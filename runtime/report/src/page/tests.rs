@@ -447,7 +447,7 @@ fn a_reason_is_said_once_with_all_that_it_is_for() {
         .lines()
         .find(|line| line.contains(",loss_ratio,"))
         .unwrap();
-    assert_eq!(loss.matches("as good as").count(), 1, "{loss}");
+    assert_eq!(loss.matches("independent value").count(), 1, "{loss}");
     // For programs each figure stands by itself.
     let csv = render(&[material(summary)], None, Format::Csv, None).unwrap();
     assert_eq!(csv.matches("no whole motion loop").count(), 10);

@@ -11,6 +11,8 @@ use hil_present::terminal::canvas::Canvas;
 /// Columns of a line's label, with the blank behind it.
 const LABEL_WIDTH_MIN: usize = 14;
 const LABEL_WIDTH_MAX: usize = 36;
+/// Lines of what the emulated links do, where not all is shown.
+const BRIEF_LINK_LINES: usize = 2;
 
 /// How much of it is shown.
 #[derive(Debug, Clone, Copy)]
@@ -19,8 +21,6 @@ pub(super) struct AnswerExtent {
     pub(super) harms: Option<usize>,
     /// Lines of what stands beside a label.
     pub(super) lines: usize,
-    /// Lines of what the emulated links do.
-    pub(super) link_lines: usize,
 }
 
 impl AnswerExtent {
@@ -28,7 +28,6 @@ impl AnswerExtent {
     pub(super) const WHOLE: Self = Self {
         harms: None,
         lines: 20,
-        link_lines: 20,
     };
 }
 
@@ -55,12 +54,16 @@ pub(super) fn answer(
         canvas.paragraph(0, answer.tone(), &words);
     }
     let facts = AnswerFacts::of(summary, assessment, &answer, extent.harms);
+    let link_lines = match extent.harms {
+        None => extent.lines,
+        Some(_) => BRIEF_LINK_LINES,
+    };
     let all: Vec<_> = [facts.measurement, facts.sample]
         .into_iter()
         .chain(facts.harms)
         .chain(facts.rest)
         .map(|field| (field, extent.lines))
-        .chain(facts.links.map(|links| (links, extent.link_lines)))
+        .chain(facts.links.map(|links| (links, link_lines)))
         .collect();
     let widest = all.iter().map(|(one, _)| columns(&one.label) + 2).max();
     let label_width = widest.unwrap_or(0).clamp(LABEL_WIDTH_MIN, LABEL_WIDTH_MAX);

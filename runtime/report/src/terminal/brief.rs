@@ -48,7 +48,6 @@ const EXTENTS: [Extent; 4] = [
         answer: AnswerExtent {
             harms: Some(6),
             lines: 5,
-            link_lines: 2,
         },
     },
     Extent {
@@ -60,7 +59,6 @@ const EXTENTS: [Extent; 4] = [
         answer: AnswerExtent {
             harms: Some(6),
             lines: 4,
-            link_lines: 2,
         },
     },
     Extent {
@@ -72,7 +70,6 @@ const EXTENTS: [Extent; 4] = [
         answer: AnswerExtent {
             harms: Some(4),
             lines: 3,
-            link_lines: 2,
         },
     },
     Extent {
@@ -84,7 +81,6 @@ const EXTENTS: [Extent; 4] = [
         answer: AnswerExtent {
             harms: Some(2),
             lines: 2,
-            link_lines: 2,
         },
     },
 ];

@@ -228,8 +228,7 @@ fn a_sample_that_is_too_small_shows_no_absence_of_harm() {
     count_all(&mut enough);
     let page = brief(&enough, 100, Style::Plain);
     let page = page.split_whitespace().collect::<Vec<_>>().join(" ");
-    let means =
-        "NO means none in 10 motion loops sent excludes a rate of 300 per 1,000 or more (95 %)";
+    let means = "NO means none in 10 motion loops sent: a rate of up to 300 per 1,000 remains possible (95 %)";
     assert!(page.contains(means), "{page}");
     let enough = answer(&enough);
     assert_eq!((enough.hurt.clone(), enough.tone()), (Hurt::No, Tone::Good));
