@@ -63,9 +63,9 @@ third_party() {
     done
 }
 
-# For a test the features of the whole workspace will do, which `cargo test` has built already.
+# For a test the features of the whole workspace and its tests will do, which `cargo test` takes too: one test selects them.
 SELECTION=(--package hil-runtime --package hil-recorder)
-[[ $PROFILE != dev ]] || SELECTION=(--workspace)
+[[ $PROFILE != dev ]] || SELECTION=(--workspace --test tidy)
 cargo build --locked --profile "$PROFILE" "${SELECTION[@]}" --bin hil-runtime --bin hil-recorder >&2
 rm -rf "$STAGE"
 mkdir -p "$STAGE/bin" "$OUTPUT"

@@ -97,9 +97,9 @@ fn build(package: &str) -> Result<PathBuf, String> {
     let cargo = env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let output = Command::new(cargo)
         .current_dir(workspace_folder())
-        // With the features of the whole workspace: those of one package alone would build most of
-        // what it depends on a second time.
-        .args(["build", "--workspace", "--bin", package])
+        // With the features of the whole workspace and of its tests: others would build most of what it depends on a
+        // second time.
+        .args(["build", "--workspace", "--bin", package, "--test", "tidy"])
         .args([
             "--profile",
             &profile(),
